@@ -77,7 +77,7 @@ def build(
         raise InputError(
             f"controller {name}: scenario {scenario.name} has no oracle; choose another [HM-COMPARE-001]"
         )
-    model = _oracle(scenario, prior)
+    model = _make_oracle(scenario, prior)
     ocp = make_ocp(prior, control)
     rivals = [CondensedController(kit.models[m], ocp) for m in ("prior", "hybrid")]
     best = BestOf(SQPController(model, ocp, iterations=ORACLE_ITERATIONS), rivals=rivals, most=1)
@@ -95,7 +95,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     """
     models = dict(artifact.models)
     if scenario.oracle is not None:
-        models["oracle"] = _oracle(scenario, artifact.models["prior"])
+        models["oracle"] = _make_oracle(scenario, artifact.models["prior"])
     errors = {name: process_noise(model, recordings) for name, model in artifact.models.items()}
     # errors of the plant's own equations come from the smoothing only: start from the better model's errors
     errors["oracle"] = errors["hybrid"]
@@ -109,7 +109,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
     return no_surer_than_prior(scenario, found)
 
 
-def _oracle(scenario: Scenario, prior: HybridModel) -> HybridModel:
+def _make_oracle(scenario: Scenario, prior: HybridModel) -> HybridModel:
     """The oracle's model, with the operating point and disturbance model of the prior."""
     assert scenario.oracle is not None
     return replace(
@@ -158,11 +158,11 @@ def find_noise(
     if own := [name for name in needed if name in held]:
         source = f"{', '.join(lacking)}: {source}; {', '.join(own)}: the model's own"
     return no_surer_than_prior(
-        scenario, {**_estimated_noise(machine, artifact, lacking, seed), **held}
+        scenario, {**_estimate_noise(machine, artifact, lacking, seed), **held}
     ), source
 
 
-def _estimated_noise(
+def _estimate_noise(
     scenario: Scenario, artifact: Kit, lacking: Sequence[str], seed: int
 ) -> Mapping[str, Array]:
     from hybrid_mpc.identify.delay import shifted

@@ -352,7 +352,7 @@ class Bench:
     def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
         """Estimator and controller of a specification; they have no memory, so many loops can share them."""
         kit = self.kit(spec)
-        key = (spec.model, spec.controller, spec.solver, spec.horizon, self._stated(spec))
+        key = (spec.model, spec.controller, spec.solver, spec.horizon, self._find_own_problem(spec))
         if key not in self._built:
             self._built[key] = build(
                 spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver
@@ -376,7 +376,7 @@ class Bench:
         hybrid = kit.models["hybrid"]
         if spec.guard == "rest":
             return make_resting_guard(hybrid)
-        key = (spec.model, spec.guard, spec.solver, spec.horizon, self._stated(spec))
+        key = (spec.model, spec.guard, spec.solver, spec.horizon, self._find_own_problem(spec))
         if key not in self._guards:
             if spec.guard == "prior":
                 estimator, controller = self.parts(
@@ -390,7 +390,7 @@ class Bench:
                 )
         return self._guards[key]
 
-    def _stated(self, spec: LoopSpec) -> str:
+    def _find_own_problem(self, spec: LoopSpec) -> str:
         """Name of the task if it has a control problem of its own; empty for that of all tasks."""
         return spec.task if spec.task in self.kit(spec).loop.control else ""
 
@@ -535,9 +535,9 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         seed=spec.seed,
         seconds=len(r.t) * r.dt,
         cost=r.cost,
-        tracking_rmse=_by(tracked, errors),
-        largest_x=_by(labels, np.abs(r.x).max(axis=0)),
-        largest_u=_by(inputs, np.abs(r.u).max(axis=0)),
+        tracking_rmse=_name_values(tracked, errors),
+        largest_x=_name_values(labels, np.abs(r.x).max(axis=0)),
+        largest_u=_name_values(inputs, np.abs(r.u).max(axis=0)),
         limits=limits_used(problem, r, model),
         excess=excess(problem, r, model),
         sources={source.name: r.source.count(source.name) / len(r.source) for source in Source},
@@ -552,7 +552,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
     )
 
 
-def _by(labels: Sequence[str], values: Array) -> dict[str, float]:
+def _name_values(labels: Sequence[str], values: Array) -> dict[str, float]:
     return dict(zip(labels, values.tolist(), strict=True))
 
 

@@ -172,11 +172,11 @@ class SetPoint:
     @cached_property
     def held(self) -> list[int]:
         """Indices of the controlled outputs."""
-        return held_outputs(self.model, self.problem, *self.rest, self.w)
+        return find_controlled_outputs(self.model, self.problem, *self.rest, self.w)
 
     def errors(self, y: Array, u: Array) -> Array:
         """Deviations ``(n, n_y)`` of measured outputs ``(n, n_y)`` from the set-point, under inputs ``(n, n_u)``."""
-        return errors_of(self.model, self.problem, self.reference, self.w, y, u)
+        return compute_errors(self.model, self.problem, self.reference, self.w, y, u)
 
     @property
     def sigma(self) -> Array:
@@ -270,7 +270,7 @@ class Tested:
     samples: int
 
 
-def held_outputs(model: HybridModel, problem: OCP, x: Array, u: Array, w: Array) -> list[int]:
+def find_controlled_outputs(model: HybridModel, problem: OCP, x: Array, u: Array, w: Array) -> list[int]:
     """Indices of the controlled outputs: weighted ones, or those that depend on a weighted state at a point."""
     if problem.n_y:
         return [int(i) for i in np.flatnonzero(problem.q_y > 0)]
@@ -278,7 +278,7 @@ def held_outputs(model: HybridModel, problem: OCP, x: Array, u: Array, w: Array)
     return [int(i) for i in np.flatnonzero(np.any(by_x[:, problem.q > 0] != 0, axis=1))]
 
 
-def errors_of(model: HybridModel, problem: OCP, reference: Array, w: Array, y: Array, u: Array) -> Array:
+def compute_errors(model: HybridModel, problem: OCP, reference: Array, w: Array, y: Array, u: Array) -> Array:
     """Deviations ``(n, n_y)`` of measured outputs ``(n, n_y)`` from a set-point ``(columns,)``, with the applied inputs
     ``(n, n_u)``.
     """
@@ -297,14 +297,14 @@ def task_end(kit: Kit, task: Task, loop: Mapping[str, Array]) -> TaskEnd | None:
         loop: Its arrays ``u`` ``(n, n_u)`` and ``y`` ``(n, n_y)``.
     """
     model, problem = kit.models[kit.recommended], task.control or kit.problem()
-    end = end_of(task, model)
+    end = find_end(task, model)
     if end is None:
         return None
     row, w = end
     x = model.x0 if problem.n_y else row[: model.n_x]
-    held = held_outputs(model, problem, x, model.u0, w)
+    held = find_controlled_outputs(model, problem, x, model.u0, w)
     before = np.vstack([loop["u"][:1], loop["u"][:-1]])
-    errors = errors_of(model, problem, row, w, loop["y"], before)
+    errors = compute_errors(model, problem, row, w, loop["y"], before)
     return (
         TaskEnd(task.name, deviations(model.outputs, held, np.array(kit.sensor_sigma), errors))
         if held
@@ -337,7 +337,9 @@ def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
             same.append(task)
     if not groups:
         groups = [(kit.problem(), [])]
-    ends = [{task.name: end for task in own if (end := end_of(task, model)) is not None} for _, own in groups]
+    ends = [
+        {task.name: end for task in own if (end := find_end(task, model)) is not None} for _, own in groups
+    ]
     if not any(ends):  # only trajectories
         groups, ends = groups[:1], ends[:1]
     for (problem, own), at in zip(groups, ends, strict=True):
@@ -352,7 +354,7 @@ def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
     return found
 
 
-def end_of(task: Task, model: HybridModel) -> tuple[Array, Array] | None:
+def find_end(task: Task, model: HybridModel) -> tuple[Array, Array] | None:
     """Set-point and measured disturbances at the end of a task; None if they change there, or if weights change."""
     t = task.duration * np.linspace(1.0 - END, 1.0, 50)
     rows = np.asarray(task.reference(t), dtype=np.float64)
@@ -429,10 +431,10 @@ def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int
     before = np.vstack([result.u[:1], result.u[:-1]])
     errors = point.errors(result.y, before)
     found = deviations(point.model.outputs, point.held, point.sigma, errors)
-    settled = _settled(errors[:, point.held], point.sigma[point.held], point.problem.horizon)
+    settled = _find_settled(errors[:, point.held], point.sigma[point.held], point.problem.horizon)
     kept = all(one.kept for one in found)
     settled_s = None if settled is None or not kept else settled * model.dt
-    return Trial(found, settled_s, "" if kept else _why(point, result, errors), result)
+    return Trial(found, settled_s, "" if kept else _explain_offset(point, result, errors), result)
 
 
 def deviations(
@@ -449,7 +451,7 @@ def deviations(
         )
 
 
-def _settled(errors: Array, sigma: Array, horizon: int) -> int | None:
+def _find_settled(errors: Array, sigma: Array, horizon: int) -> int | None:
     """Period from which moving means of the errors over half a horizon stay within twice the noise; None: never.
 
     Twice, because the observer passes noise on to the input, and means of few samples scatter.
@@ -463,13 +465,13 @@ def _settled(errors: Array, sigma: Array, horizon: int) -> int | None:
     return last if last < len(means) else None
 
 
-def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
+def _explain_offset(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
     """Why a loop does not settle within the noise."""
     problem, model = point.problem, point.model
     late = slice(int((1.0 - END) * len(errors)), None)
     if not np.all(np.isfinite(result.x)):
         return "the loop diverges"
-    away = np.abs(result.x[late] - point.rest[0]).max(axis=0) > 2.0 * np.abs(_room(model))
+    away = np.abs(result.x[late] - point.rest[0]).max(axis=0) > 2.0 * np.abs(_compute_ranges(model))
     if away.any():
         return f"the loop does not keep {model.states[int(np.flatnonzero(away)[0])].name} within its range"
     edge = AT_LIMIT * problem.input_range
@@ -500,7 +502,7 @@ def _why(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
     return "no disturbance of the model explains the error"
 
 
-def _room(model: HybridModel) -> Array:
+def _compute_ranges(model: HybridModel) -> Array:
     """Ranges of the states ``(n_x,)``; infinite without bounds."""
     return np.array([s.upper - s.lower for s in model.states])
 
@@ -557,12 +559,12 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
             "(docs/disturbances.md).",
         )  # fmt: skip
     if worst.why:
-        return Promise(name, "doubted", within, remedy_of(worst.why))
+        return Promise(name, "doubted", within, choose_remedy(worst.why))
     times = [one.settled_s for one in trials if one.settled_s is not None]
     return Promise(name, "shown", f"{within}, after {max(times):.3g} s at most" if times else within)
 
 
-def remedy_of(why: str) -> str:
+def choose_remedy(why: str) -> str:
     """Remedy for an offset, by its reason."""
     if "limit" in why:
         return "Choose set-points farther from the limits of the inputs, or use a stronger actuator."
@@ -615,7 +617,8 @@ def horizon(points: Sequence[SetPoint]) -> Promise:
     """
     name = "horizon"
     point, cost = min(
-        ((one, _left_costs(one)) for one in points), key=lambda pair: -pair[1][pair[0].problem.horizon]
+        ((one, _compute_left_costs(one)) for one in points),
+        key=lambda pair: -pair[1][pair[0].problem.horizon],
     )
     dt, n = point.model.dt, point.problem.horizon
     share = 1.0 - float(cost[n])
@@ -638,7 +641,7 @@ def horizon(points: Sequence[SetPoint]) -> Promise:
     )
 
 
-def _left_costs(point: SetPoint) -> Array:
+def _compute_left_costs(point: SetPoint) -> Array:
     """Remaining share of the cost of a deviation after each period, ``(m,)``."""
     model, n = point.model, point.problem.horizon
     a, b, q, r = make_ocp(model, point.problem).linear_quadratic(model)
@@ -684,7 +687,7 @@ def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Pr
     if good:
         return Promise(name, "shown", evidence)
     evidence += f". Beyond these margins the linearized loop is unstable (recommended distance: {MODULUS:g})"
-    other = _distance(of_prior, signal)
+    other = _find_distance(of_prior, signal)
     if other is None:
         return Promise(name, "doubted", evidence, SOFTER)
     evidence += f"; with the fitted prior as model and controller the distance is {other:.2g}"
@@ -701,7 +704,7 @@ def _margins_at(point: SetPoint) -> list[tuple[Signal, Margins]]:
     return [(signal, loop.margins(j)) for j, signal in enumerate(model.inputs)]
 
 
-def _distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
+def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
     """Least distance from -1 at an input over set-points; None without a linearized loop."""
     try:
         found = [own.modulus for point in points for s, own in _margins_at(point) if s == signal]
@@ -860,7 +863,7 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
     for point, one in zip(points, trials, strict=True):
         n, dt = point.problem.horizon, model.dt
         periods = periods_to_find(quiet(point.estimator), SEARCHED * n)
-        dead = [_disturbance(model, j) for j, v in enumerate(periods) if not math.isfinite(v)]
+        dead = [_name_disturbance(model, j) for j, v in enumerate(periods) if not math.isfinite(v)]
         if dead:
             evidence = f"the load at {dead[0]} is not estimated: the observer's gain on it is zero"
             return Promise(name, "not promised", evidence, remedy)
@@ -881,7 +884,7 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
     return Promise(name, "doubted", worst[1], remedy)
 
 
-def _disturbance(model: HybridModel, j: int) -> str:
+def _name_disturbance(model: HybridModel, j: int) -> str:
     """Name of a disturbance."""
     chosen = model.disturbance_model
     if chosen is None:
@@ -951,7 +954,9 @@ def examine(
         worst = max(range(number), key=lambda draw: trials[draw].worst.size)
         if trials[worst].why.startswith(SLOW):
             longer = trial(point, worst, max(2 * length, LONGER))
-            trials[worst] = replace(trials[worst], why=f"{trials[worst].why}; {_needed(longer)}")
+            trials[worst] = replace(
+                trials[worst], why=f"{trials[worst].why}; {_explain_longer_trial(longer)}"
+            )
         every.append(trials)
     own = [one for trials in every for one in trials]
     report(len(points), len(points), "margins, limits, observer")
@@ -960,7 +965,7 @@ def examine(
         tasks_end(ends, where),
         step_time(own, 1e3 * points[0].model.dt),
         horizon(points),
-        margins(points, _of_prior(kit, tasks)),
+        margins(points, _find_prior_points(kit, tasks)),
         limits(points, own, given_way or {}),
         process_noise(kit),
         innovations(tested),
@@ -968,12 +973,12 @@ def examine(
     )
 
 
-def _of_prior(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
+def _find_prior_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
     """Set-points of the fitted prior; empty if the kit recommends the prior."""
     return [] if kit.recommended == "prior" else set_points(replace(kit, recommended="prior"), tasks)
 
 
-def _needed(longer: Trial) -> str:
+def _explain_longer_trial(longer: Trial) -> str:
     """Text that says whether a slow loop settles in a longer trial."""
     seconds = len(longer.result.t) * longer.result.dt
     return f"in a loop of {seconds:.3g} s it {'does not settle either' if longer.why else 'settles'}"

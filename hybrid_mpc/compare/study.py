@@ -66,9 +66,9 @@ class FaultKind:
         Fields(self, f"random fault {self.target}").refuse()
         if self.target != LATE and not str(self.target).startswith("plant_"):
             known(self.target, (*SIGNAL_TARGETS, LATE), "fault target")
-        _span((self.low, self.high), f"random fault {self.target}: low to high")
+        _check_span((self.low, self.high), f"random fault {self.target}: low to high")
         if self.length is not None:
-            span = _span(self.length, f"random fault {self.target}: length", above=0.0)
+            span = _check_span(self.length, f"random fault {self.target}: length", above=0.0)
             object.__setattr__(self, "length", span)
 
 
@@ -105,9 +105,9 @@ class RandomFaults:
             for i, k in enumerate(self.kinds)
         )
         object.__setattr__(self, "kinds", kinds)
-        object.__setattr__(self, "start", _span(self.start, "random_faults: start", least=0.0))
-        object.__setattr__(self, "length", _span(self.length, "random_faults: length", above=0.0))
-        fewest, most = (int(n) for n in _span(self.at_once, "random_faults: at_once", least=0.0))
+        object.__setattr__(self, "start", _check_span(self.start, "random_faults: start", least=0.0))
+        object.__setattr__(self, "length", _check_span(self.length, "random_faults: length", above=0.0))
+        fewest, most = (int(n) for n in _check_span(self.at_once, "random_faults: at_once", least=0.0))
         object.__setattr__(self, "at_once", (fewest, most))
         if most < 1 or most > len(kinds):
             raise InputError(
@@ -160,7 +160,7 @@ def factors(vary: Sequence[tuple[str, float]], seed: int, draw: int) -> tuple[tu
     )
 
 
-def _span(
+def _check_span(
     values: Sequence[float], what: str, *, least: float = -math.inf, above: float = -math.inf
 ) -> tuple[float, float]:
     """Two numbers in ascending order; InputError otherwise."""
@@ -215,8 +215,8 @@ class Study:
         (24, 24)
         >>> Study("golf_robot", "m", controllers=["hybird"])
         Traceback (most recent call last):
-        hybrid_mpc.errors.InputError: no controller 'hybird'; did you mean 'hybrid'? There are: prior, prior_observer, \
-hybrid, hybrid_observer, oracle, oracle_state
+        hybrid_mpc.errors.InputError: no controller 'hybird'; did you mean 'hybrid'? Known names: prior, \
+prior_observer, hybrid, hybrid_observer, oracle, oracle_state
     """
 
     scenario: str
@@ -238,7 +238,7 @@ hybrid, hybrid_observer, oracle, oracle_state
     name: Label = "study"
 
     def __post_init__(self) -> None:
-        for field, value in _normal(self).items():
+        for field, value in _unify_fields(self).items():
             object.__setattr__(self, field, value)
         for name in AXES:
             values = getattr(self, name)
@@ -294,7 +294,7 @@ hybrid, hybrid_observer, oracle, oracle_state
     def runs(self) -> Iterator[LoopSpec]:
         """The runs, ordered by controller."""
         tasks = [t.name for t in selected_tasks(ready(load_scenario(self.scenario)), self.tasks)]
-        drawn = [self._drawn(i) for i in range(self.draws)]
+        drawn = [self._draw(i) for i in range(self.draws)]
         outer = product(
             self.folders, tasks, self.controllers, self.solvers, self.horizons, self.monitors, self.fault_sets
         )
@@ -327,7 +327,7 @@ hybrid, hybrid_observer, oracle, oracle_state
         whole: dict[str, Any] = plain(asdict(self))
         return {**whole, "models": list(self.folders)}
 
-    def _drawn(self, i: int) -> tuple[tuple[tuple[str, float], ...], tuple[Fault, ...], Intervals]:
+    def _draw(self, i: int) -> tuple[tuple[tuple[str, float], ...], tuple[Fault, ...], Intervals]:
         faults: tuple[tuple[Fault, ...], Intervals] = ((), ())
         if isinstance(self.random_faults, RandomFaults):
             faults = self.random_faults.drawn(generator(self.seed, i, "faults"))
@@ -390,12 +390,12 @@ hybrid, hybrid_observer, oracle, oracle_state
             )
 
 
-def _normal(s: Study) -> dict[str, Any]:
+def _unify_fields(s: Study) -> dict[str, Any]:
     """Fields that have several input forms, as tuples."""
     models = {"model": s.models} if isinstance(s.models, str | Path) else s.models
     try:
-        pairs = tuple((str(k), str(v)) for k, v in _items(models))
-        vary = tuple((str(k), v) for k, v in _items(s.vary))
+        pairs = tuple((str(k), str(v)) for k, v in _read_items(models))
+        vary = tuple((str(k), v) for k, v in _read_items(s.vary))
     except (TypeError, ValueError) as error:
         raise InputError(
             f"study: models and vary must be mappings (name: value); {error} [HM-COMPARE-036]"
@@ -404,7 +404,7 @@ def _normal(s: Study) -> dict[str, Any]:
     if isinstance(drawn, Mapping):
         drawn = record(RandomFaults, drawn, "random_faults")
     lists: dict[str, Any] = {
-        name: _listed(getattr(s, name), name)
+        name: _read_list(getattr(s, name), name)
         for name in ("tasks", "controllers", "solvers", "horizons", "monitors")
     }
     if isinstance(s.seeds, int) and not isinstance(s.seeds, bool):
@@ -415,22 +415,22 @@ def _normal(s: Study) -> dict[str, Any]:
             )
         seeds: tuple[Any, ...] = tuple(range(s.seeds))
     else:
-        seeds = _listed(s.seeds, "seeds")
-    faults = tuple(_fault_set(entry) for entry in _listed(s.faults, "faults"))
+        seeds = _read_list(s.seeds, "seeds")
+    faults = tuple(_read_faults(entry) for entry in _read_list(s.faults, "faults"))
     return {**lists, "models": pairs, "vary": vary, "random_faults": drawn, "seeds": seeds, "faults": faults}
 
 
-def _items(value: Any) -> Any:
+def _read_items(value: Any) -> Any:
     return value.items() if isinstance(value, Mapping) else value
 
 
-def _listed(value: Any, name: str) -> tuple[Any, ...]:
+def _read_list(value: Any, name: str) -> tuple[Any, ...]:
     if isinstance(value, str | Fault) or value is None or not isinstance(value, Sequence):
         raise InputError(f"study: {name} must be a list, got {value!r}; write [{value!r}] [HM-COMPARE-038]")
     return tuple(value)
 
 
-def _fault_set(entry: Any) -> tuple[Fault, ...]:
+def _read_faults(entry: Any) -> tuple[Fault, ...]:
     if isinstance(entry, Fault):
         return (entry,)
     if isinstance(entry, str):
@@ -440,7 +440,7 @@ def _fault_set(entry: Any) -> tuple[Fault, ...]:
         raise InputError(
             f"study: faults must be texts, lists of texts, or Fault; got {entry!r} [HM-COMPARE-039]"
         )
-    return tuple(fault for part in entry for fault in _fault_set(part))
+    return tuple(fault for part in entry for fault in _read_faults(part))
 
 
 MOST_YAML = 2**16
@@ -458,7 +458,7 @@ def read_study(path: str | Path, **instead: Any) -> Study:
             names the nearest one), or the study is invalid.
     """
     path = Path(path)
-    keys = _mapping(path)
+    keys = _read_mapping(path)
     models, here = keys.get("models"), path.parent
     if isinstance(models, str):
         models = {"model": models}
@@ -475,12 +475,12 @@ def read_study(path: str | Path, **instead: Any) -> Study:
     return study if "name" in keys else replace(study, name=path.stem)
 
 
-def _mapping(path: Path) -> dict[str, Any]:
+def _read_mapping(path: Path) -> dict[str, Any]:
     with named_extra("a study's file"):
         import yaml
 
     try:
-        found = yaml.load(read_bytes(path, MOST_YAML), Loader=_loader())
+        found = yaml.load(read_bytes(path, MOST_YAML), Loader=_make_loader())
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
@@ -495,7 +495,7 @@ def _mapping(path: Path) -> dict[str, Any]:
 
 
 @cache
-def _loader() -> Any:
+def _make_loader() -> Any:
     """A YAML loader of plain data: texts, numbers, true, false, null, lists and mappings without duplicate keys.
 
     It reads the core schema of YAML 1.2; PyYAML's YAML 1.1 would turn ``on`` into a flag and ``1:30`` into a number.

@@ -128,7 +128,7 @@ class RunLog:
         self._held.enter_context(locked(folder))
         files = segments(folder)
         self._number = len(files) - 1 if files else 0
-        self._rows = _repaired(files[-1]) if files else 0
+        self._rows = _repair(files[-1]) if files else 0
         self._file = self._open()
 
     def __enter__(self) -> Self:
@@ -187,10 +187,10 @@ def rows(folder: Path) -> Iterator[RunRow]:
             for number, line in enumerate(iter(partial(file.readline, MOST_LINE), b""), 1):
                 if not line.endswith(b"\n") and len(line) < MOST_LINE:
                     return
-                yield _parsed(line, path, number)
+                yield _parse(line, path, number)
 
 
-def _parsed(line: bytes, path: Path, number: int) -> RunRow:
+def _parse(line: bytes, path: Path, number: int) -> RunRow:
     try:
         if len(line) == MOST_LINE:
             raise ValueError(f"longer than {MOST_LINE} bytes [HM-COMPARE-046]")
@@ -206,7 +206,7 @@ def _parsed(line: bytes, path: Path, number: int) -> RunRow:
     return RunRow(name, status, str(why), columns)
 
 
-def _repaired(path: Path) -> int:
+def _repair(path: Path) -> int:
     """Number of rows of a file, after removing an incomplete last line."""
     count = whole = 0
     with path.open("rb") as file:
@@ -230,7 +230,7 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
         last[row.id] = i
         for key, value in row.plain().items():
             kinds.setdefault(key, set()).add(type(value))
-    columns = {key: _column(found - {type(None)}) for key, found in kinds.items()}
+    columns = {key: _convert_column(found - {type(None)}) for key, found in kinds.items()}
     schema = pa.schema([(key, kind) for key, (kind, _) in columns.items()])
     schema = schema.with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
     final = (row.plain() for i, row in enumerate(rows(log)) if last[row.id] == i)
@@ -282,7 +282,7 @@ def provenance_of(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:
+def _convert_column(found: set[type]) -> tuple[pa.DataType, Callable[[Any], Any]]:
     """Arrow type of a column with values of these Python types, and the conversion of its values."""
     import pyarrow as pa
 

@@ -119,7 +119,7 @@ class StudyResults:
         """
         table, by = self._checked(value), self.factors if by is None else list(by)
         found = []
-        for key, group in _groups(table, by):
+        for key, group in _group_rows(table, by):
             units = self._units(group, value)
             middle, half = _interval(units[value])
             left_out = len(group) - int(np.isfinite(group[value]).sum())
@@ -159,7 +159,7 @@ class StudyResults:
             )
         by = [c for c in self.factors if c != over] if by is None else list(by)
         found = []
-        for key, group in _groups(table, by):
+        for key, group in _group_rows(table, by):
             first = self._units(group[group[over] == base], value)
             for level in levels:
                 if level != base:
@@ -201,7 +201,7 @@ class StudyResults:
                 "differ. Compare studies that share them [HM-COMPARE-052]"
             )
         found = []
-        for key, group in _groups(joined, by):
+        for key, group in _group_rows(joined, by):
             first = self._units(group, value)
             second = self._units(group.assign(**{value: group[value + " "]}), value)
             found.append((*key, *_difference(first, second, value)))
@@ -225,7 +225,7 @@ class StudyResults:
 DIFFERENCE = ("n", "base", "difference", "low", "high", "relative", "ratio", "better")
 
 
-def _groups(table: pd.DataFrame, by: Sequence[str]) -> Any:
+def _group_rows(table: pd.DataFrame, by: Sequence[str]) -> Any:
     """Groups with their keys, in the order of the table; a single group for no columns."""
     if not by:
         return [((), table)]
@@ -284,15 +284,15 @@ def write_study_report(results: StudyResults, path: str | Path | None = None) ->
             "[HM-COMPARE-054]"
         )
     with tempfile.TemporaryDirectory() as folder:
-        report = _report(results, Path(folder))
+        report = _build_report(results, Path(folder))
         return write_report(path or results.folder / "report.html", report)
 
 
-def _report(results: StudyResults, folder: Path) -> Report:
+def _build_report(results: StudyResults, folder: Path) -> Report:
     study, note = results.note.study, results.note
-    costs = _table(results.summary(), "cost: mean, ends of the 95 % interval, runs left out.")
+    costs = _make_table(results.summary(), "cost: mean, ends of the 95 % interval, runs left out.")
     sections = [
-        _what(results),
+        _describe_study(results),
         Section("Costs", COST_TEXT, _figure(_distributions, results, folder), [costs]),
         *_comparison(results, folder),
         *_tracking(results, folder),
@@ -347,25 +347,25 @@ def _head(results: StudyResults) -> list[KeyFigure]:
     return figures
 
 
-def _what(results: StudyResults) -> Section:
+def _describe_study(results: StudyResults) -> Section:
     study = results.note.study
     defaults: tuple[Any, ...] = (None, "", [], [None], ["own"], [[]], {})
-    rows = [(key, _short(value)) for key, value in study.items() if value not in defaults]
+    rows = [(key, _shorten(value)) for key, value in study.items() if value not in defaults]
     rows += [(f"model {k}: noise", m.noise.source) for k, m in results.note.models.items()]
     return Section("Configuration", (), (), [Table(("setting", "value"), rows)])
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     if isinstance(value, list) and len(value) > 12:
-        return f"{len(value)} values, {_short(value[0])} to {_short(value[-1])}"
+        return f"{len(value)} values, {_shorten(value[0])} to {_shorten(value[-1])}"
     if isinstance(value, list):
-        return ", ".join(_short(v) for v in value)
+        return ", ".join(_shorten(v) for v in value)
     if isinstance(value, dict):
-        return "; ".join(f"{k}: {_short(v)}" for k, v in value.items() if v not in (None, 0.0, False))
+        return "; ".join(f"{k}: {_shorten(v)}" for k, v in value.items() if v not in (None, 0.0, False))
     return str(value)
 
 
-def _table(found: pd.DataFrame, caption: str) -> Table:
+def _make_table(found: pd.DataFrame, caption: str) -> Table:
     rows = [tuple(_cell(v) for v in row) for row in found.itertuples(index=False)]
     return Table(tuple(found.columns), rows, caption)
 
@@ -375,17 +375,17 @@ def _cell(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _over(results: StudyResults) -> str | None:
+def _find_compared_column(results: StudyResults) -> str | None:
     """The column whose levels are compared: the controller if it varies, else another varying column."""
     order = ("controller", "model", "solver", "horizon", "faults", "monitor")
     return next((c for c in order if c in results.factors), None)
 
 
 def _comparison(results: StudyResults, folder: Path) -> list[Section]:
-    over = _over(results)
+    over = _find_compared_column(results)
     if over is None:
         return []
-    table = _table(results.paired(over=over), f"Cost of each {over} minus the cost of the first.")
+    table = _make_table(results.paired(over=over), f"Cost of each {over} minus the cost of the first.")
     return [Section("Paired differences", PAIRED_TEXT, _figure(_differences, results, folder), [table])]
 
 
@@ -402,9 +402,11 @@ def _tracking(results: StudyResults, folder: Path) -> list[Section]:
         if not (found["n"] > 0).any():
             continue
         tables.append(
-            _table(found[found["n"] > 0], f"{label}: mean, ends of the 95 % interval, runs left out.")
+            _make_table(found[found["n"] > 0], f"{label}: mean, ends of the 95 % interval, runs left out.")
         )
-        values = {task: {str(k): g[column].to_numpy() for k, g in rows} for task, rows in _levels(results)}
+        values = {
+            task: {str(k): g[column].to_numpy() for k, g in rows} for task, rows in _group_levels(results)
+        }
         some = {task: row for task, row in values.items() if any(np.isfinite(v).any() for v in row.values())}
         figure = save(studies.distributions(some, label), folder / f"tracking_{i}.png")
         figures.append((figure, f"Distribution of the {label} over the runs of each task."))
@@ -417,7 +419,7 @@ def _task_figures(results: StudyResults) -> list[Section]:
         found = results.summary(name)
         found = found[found["n"] > 0]
         if len(found):
-            tables.append(_table(found, f"{name.removeprefix('task_')}: mean."))
+            tables.append(_make_table(found, f"{name.removeprefix('task_')}: mean."))
     return [Section("The tasks' own figures", (), (), tables)] if tables else []
 
 
@@ -442,7 +444,7 @@ def _figure(draw: Any, results: StudyResults, folder: Path) -> Sequence[tuple[Pa
     return [(save(figure, folder / f"{draw.__name__.strip('_')}.png"), caption)]
 
 
-def _levels(results: StudyResults) -> Any:
+def _group_levels(results: StudyResults) -> Any:
     """Groups of rows by task and, within a task, by all other varying columns, with a name for each group."""
     others = [c for c in results.factors if c != "task"]
     for task, group in results.table.groupby("task", sort=False):
@@ -451,13 +453,13 @@ def _levels(results: StudyResults) -> Any:
 
 
 def _distributions(results: StudyResults) -> tuple[Any, str]:
-    values = {task: {str(k): g["cost"].to_numpy() for k, g in rows} for task, rows in _levels(results)}
+    values = {task: {str(k): g["cost"].to_numpy() for k, g in rows} for task, rows in _group_levels(results)}
     caption = "Distribution of the cost over the runs of each task."
     return studies.distributions(values, "cost [-]"), caption
 
 
 def _differences(results: StudyResults) -> tuple[Any, str]:
-    over = _over(results)
+    over = _find_compared_column(results)
     found = results.paired(over=over or "controller")
     others = [c for c in results.factors if c not in ("task", over)]
     rows: dict[str, dict[str, tuple[float, float, float]]] = {}
@@ -472,7 +474,7 @@ def _differences(results: StudyResults) -> tuple[Any, str]:
 def _pareto(results: StudyResults) -> tuple[Any, str]:
     points = {
         task: {str(level): (float(g[STEP].mean()), float(g["cost"].mean())) for level, g in rows}
-        for task, rows in _levels(results)
+        for task, rows in _group_levels(results)
     }
     caption = "Mean cost against the duration of a step; the line is the Pareto front."
     return studies.pareto(points, "cost [-]"), caption

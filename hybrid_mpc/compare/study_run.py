@@ -127,7 +127,7 @@ def load_models(
             noise, source = find_noise(scenario, kit, study.controllers, study.run_seed)
         else:
             noise, source = {k: np.array(v) for k, v in held[label].sigma_x.items()}, held[label].source
-        found[label] = StudyModel(folder, _digest(_files(folder)), kit.with_noise(noise), source)
+        found[label] = StudyModel(folder, _hash_files(_read_files(folder)), kit.with_noise(noise), source)
     return found
 
 
@@ -181,7 +181,7 @@ class LoopRunner:
 
     def __call__(self, spec: LoopSpec) -> dict[str, Any]:
         """The loop's columns: cost, errors, limits, figures of the task, alarms, and ``timing_...``."""
-        bench, alone = _bench(self)
+        bench, alone = _load_bench(self)
         with alone:
             begin = perf_counter()
             bench.parts(spec)
@@ -190,14 +190,14 @@ class LoopRunner:
             times = {f"{TIMING}setup_s": built - begin, f"{TIMING}run_s": perf_counter() - built}
             return row.columns() | {"hidden_units": bench.kits[spec.model].models["hybrid"].n_h} | times
 
-    def with_files(self) -> LoopRunner:
+    def carry_files(self) -> LoopRunner:
         """A copy with the models' files, for workers on other computers."""
-        models = tuple(replace(m, files=_files(Path(m.folder))) for m in self.models)
+        models = tuple(replace(m, files=_read_files(Path(m.folder))) for m in self.models)
         return replace(self, models=models)
 
 
 @lru_cache(maxsize=1)
-def _bench(runner: LoopRunner) -> tuple[Bench, Lock]:
+def _load_bench(runner: LoopRunner) -> tuple[Bench, Lock]:
     """The bench of a process, and a lock for its threads."""
     kits = {m.label: load(local_folder(m)).with_noise(dict(m.noise)) for m in runner.models}
     return Bench(load_scenario(runner.scenario), kits), Lock()
@@ -206,7 +206,7 @@ def _bench(runner: LoopRunner) -> tuple[Bench, Lock]:
 def local_folder(model: ModelInput) -> Path:
     """The model's folder if this computer has it, else a temporary folder with its files."""
     folder = Path(model.folder)
-    if folder.is_dir() and _digest(_files(folder)) == model.digest:
+    if folder.is_dir() and _hash_files(_read_files(folder)) == model.digest:
         return folder
     if not model.files:
         raise InputError(
@@ -220,11 +220,11 @@ def local_folder(model: ModelInput) -> Path:
     return unpacked
 
 
-def _files(folder: Path) -> tuple[tuple[str, bytes], ...]:
+def _read_files(folder: Path) -> tuple[tuple[str, bytes], ...]:
     return tuple((name, read_bytes(folder / name, MOST_CONTENT)) for name in sorted(artifact_files(folder)))
 
 
-def _digest(files: Sequence[tuple[str, bytes]]) -> str:
+def _hash_files(files: Sequence[tuple[str, bytes]]) -> str:
     whole = hashlib.sha256()
     for name, content in files:
         whole.update(f"{name}\0{len(content)}\0".encode() + content)
@@ -277,7 +277,7 @@ def run_study(
     note = make_note(study.identity(), models, study.size)
     say.finish(f"{study.size} runs")
     if cluster is not None and isinstance(run, LoopRunner):  # workers may not see the folders of the models
-        run = run.with_files()
+        run = run.carry_files()
     engine = make_engine(partial(run_batch, run), workers, cluster, threads=THREADS)
     try:
         with open_folder(out, job_note(note), resume=resume), RunLog(out / RUNS) as log:
@@ -412,7 +412,7 @@ def execute(
         running -= 1
         batch, result = ended
         if isinstance(result, Lost):
-            result = suspects.given_up(batch, result)
+            result = suspects.give_up(batch, result)
         suspects.alone = None
         log.append(result)
         pace.learn(result)
@@ -437,7 +437,7 @@ class _Suspects:
         self.alone = self.left.pop()
         return (self.alone,)
 
-    def given_up(self, batch: Sequence[Config], lost: Lost) -> list[RunRow]:
+    def give_up(self, batch: Sequence[Config], lost: Lost) -> list[RunRow]:
         """Add the runs of a lost batch to the suspects; returns the rows of runs that count as failed."""
         found = []
         for config in batch:

@@ -112,7 +112,7 @@ def repeated(
     curve = {}
     for i in set(range(n)) - set(rates):
         v1, v0 = (first[pairs[i]], last[pairs[i]]) if i in pairs else (0.0, 0.0)
-        curve[i] = _quintic(first[i], last[i], v1, v0, period - length * dt)
+        curve[i] = _find_quintic(first[i], last[i], v1, v0, period - length * dt)
 
     rates_of = {i: polynomial.deriv() for i, polynomial in curve.items() if i in pairs}
 
@@ -157,7 +157,7 @@ def repeated(
     )
 
 
-def _quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.polynomial.Polynomial:
+def _find_quintic(p1: float, p0: float, v1: float, v0: float, time: float) -> np.polynomial.Polynomial:
     """Quintic from position ``p0`` and speed ``v0`` to ``p1`` and ``v1`` within ``time``, without acceleration at its
     ends: ``p(0) = p0, p'(0) = v0, p''(0) = 0``, and likewise at ``time``.
     """

@@ -1,8 +1,11 @@
-"""Which physical terms a prior lacks: a search over a library of terms, judged by held-out recordings.
+"""Search for physical terms that a prior lacks, evaluated on held-out recordings. No torch in here.
 
-Each step scores all candidates by one Gauss-Newton step from the present fit, with the parameters and first states, in
-every fold; fits the best few in every fold; and adds the best of those that surely lower the error. Where no single
-term does, pairs are tried. After each step, terms that later ones made needless are removed. No torch in here.
+Each step
+
+1. scores all candidates by one Gauss-Newton step of parameters and initial states from the present fit, in every fold,
+2. fits the best few candidates in every fold,
+3. adds the best candidate that reduces the held-out error significantly; if there is none, pairs are tried,
+4. removes terms that the new term made superfluous.
 """
 
 from __future__ import annotations
@@ -50,67 +53,68 @@ Places = NDArray[np.int64]
 Terms = tuple[Term, ...]
 Progress = Callable[[int, int, str], None]
 FOLDS = 5
-"""Groups of recordings that are held out in turn at most."""
+"""Maximum number of groups of recordings that are held out in turn."""
 BLOCKS = 8
-"""Pieces of evidence at least: a few recordings are cut into as many blocks."""
+"""Number of blocks that a few recordings are cut into."""
 WINDOWS = 48
-"""Windows of the search at most, shared evenly by the recordings; of short ones twice as many."""
+"""Maximum number of windows of the search, shared evenly by the recordings; twice as many for short windows."""
 SHORTER = 5
-"""How much shorter the short windows are, by which candidates are scored and begun, too."""
+"""Ratio of the lengths of long and short windows; short windows also score and start candidates."""
 TRIED = 3
-"""Candidates of a step that are fitted in every fold."""
+"""Number of candidates of a step that are fitted in every fold."""
 PAIRS = 3
-"""Pairs that are fitted in every fold where no single term is added."""
+"""Number of pairs that are fitted in every fold if no single term is added."""
 STEPS = 8
-"""Steps at most."""
+"""Maximum number of steps."""
 ITERATIONS = 12
-"""Gauss-Newton steps of a fit that starts near its end."""
+"""Gauss-Newton steps of a fit that starts near the optimum."""
 WORTH = 0.95
-"""Ratio of errors that a term has to reach at least: a parameter that takes off less is not worth its name."""
+"""Ratio of errors that a term must fall below: a smaller reduction is not worth a parameter."""
 HARM = 1.05
-"""Ratio of errors from which on a term does harm."""
+"""Ratio of errors above which a term is harmful."""
 GAIN = 0.7
-"""Ratio of errors below which a gain counts no more in the upper bound: a bound that is larger for it, and that no
-single recording of a large gain widens."""
+"""Lower limit of a recording's ratio of errors in the upper bound. It makes the bound larger, and a single recording
+with a large reduction does not widen the interval."""
 POOR = 0.7
-"""Error [spreads] of a model that explains half of the outputs' variance: where a term leaves more, only a gain beyond
-``GAIN`` counts, since small ones of such free runs are chance."""
+"""Error [spreads] of a model that explains half of the outputs' variance. If the error with a term is larger, only a
+ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance."""
 DOUBT = 0.1
-"""Probability of an error beyond an end of an interval, for all candidates of a step together that were fitted: a term
-is added where the upper end is below 1, so that it surely lowers the error."""
+"""Probability that the ratio lies beyond one end of its interval, for all fitted candidates of a step together. A term
+is added if the upper end is below 1."""
 REACH = 3.0
-"""Errors of a free run count up to so many spreads of their output: one that runs away is as bad as that."""
+"""Limit of an error of a free run, in spreads of the output, also for diverging runs."""
 FAR = 2.0
-"""A start whose error is larger by this than the other's is not tried."""
+"""Ratio of a start's error to that of the other start above which the start is not tried."""
 RIDGE = 1e-6
-"""Share that is added to the normal equations' diagonal: columns that are alike stay solvable."""
+"""Relative increase of the diagonal of the normal equations, so that equal columns stay solvable."""
 SMALL = 0.1
-"""Share of the smaller mean squared error that is added to that of every piece: pieces in which both models err
-little say little."""
+"""Share of the smaller mean squared error that is added to the mean squared error of every piece. So pieces in which
+both models have small errors have little influence."""
 FEWEST, MANY = 3, 5
-"""Pieces of evidence from which on their scatter is known; and recordings from which on each is one piece."""
+"""Minimum number of pieces of evidence for an interval; number of recordings from which on each recording is one
+piece."""
 LEAST_T = 2.0
-"""Standard errors that one parameter of each term has to differ from none at least: else the data do not tell it."""
+"""Minimum t-ratio: at least one weight of each new term must differ from zero by this many standard errors."""
 LEAST = 20
-"""Periods of the parts of a single recording at least."""
+"""Minimum periods of a part of a single recording."""
 ALONG = 4
-"""Steps of a period in which a term's state is followed along a recording."""
+"""Integration steps of a period for a term's state along a recording."""
 LOWERED = 0.99
-"""Ratio of errors over all windows that a candidate has to reach before it is fitted in every fold."""
+"""Ratio of errors over all windows that a candidate must fall below before it is fitted in every fold."""
 MEMORY = 3.0
-"""Length of a block at least, in time units: shorter ones are no separate evidence. ``FEWEST`` there are in
-any case: then a term must take off much in all of them."""
+"""Minimum length of a block [time units]; shorter blocks are not independent. There are at least ``FEWEST`` blocks in
+any case."""
 SHORTEST = 4
-"""Samples of a block at least."""
+"""Minimum samples of a block."""
 DRAWN = 200
-"""Points of a term's picture."""
+"""Number of points of a term's picture."""
 
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Windows with the piece of evidence of each sample and the fold of each window.
+    """Windows, with the piece of evidence of each sample and the fold of each window.
 
-    ``starts`` are the trajectory and the sample that each window begins with.
+    ``starts`` are the trajectory and first sample of each window.
     """
 
     windows: OutputWindows
@@ -122,12 +126,12 @@ class _HeldOut:
 
     @property
     def counted(self) -> NDArray[np.bool_]:
-        """Samples ``(n, T + 1)`` that count."""
+        """Mask ``(n, T + 1)`` of the counted samples: measured, and after the warm-up."""
         late = np.arange(self.windows.y.shape[1]) >= self.warm
         return np.asarray(np.isfinite(self.windows.y).any(axis=-1) & late)
 
     def rows(self, keep: NDArray[np.bool_]) -> OutputWindows:
-        """Some windows."""
+        """Select windows by a mask."""
         w = self.windows
         return replace(
             w, y=w.y[keep], u=w.u[keep], w=w.w[keep], x=w.x[keep], censored=w.censored[keep], known=w.known[keep],
@@ -135,12 +139,15 @@ class _HeldOut:
         )  # fmt: skip
 
     def compared(self, own: Array, other: Array, candidates: int) -> HeldOutError:
-        """Squared errors ``(n, T + 1)`` of one model over another's, which was the best of so many candidates."""
+        """Compare squared errors ``(n, T + 1)`` of a model with those of another; ``candidates`` widens the interval.
+
+        With l_i the logarithms of the ratios by piece: upper = mean(max(l, log GAIN)) + t_{n-1} std / sqrt(n).
+        """
         each = self._each(own, other)
         n, mean, error = len(each), float(each.mean()), float(np.sqrt(own[self.counted].mean()))
         if n < FEWEST:
             return HeldOutError(error, math.exp(mean), 0.0, math.inf, 1.0)
-        capped = np.maximum(each, math.log(GAIN))  # its mean is no less, its scatter not that of large gains
+        capped = np.maximum(each, math.log(GAIN))  # larger mean, and less scatter from large reductions
         scatter, safe = (max(float(v.std(ddof=1)) / math.sqrt(n), 1e-9) for v in (each, capped))
         wide = float(student.ppf(1.0 - DOUBT / candidates, n - 1))
         upper = float(capped.mean()) + wide * safe
@@ -151,7 +158,7 @@ class _HeldOut:
         )  # fmt: skip
 
     def needed(self, own: Array, other: Array, candidates: int) -> int:
-        """Recordings like these that it takes besides for a bound below 1; 0 where they would be more than tenfold."""
+        """Number of further similar recordings for an upper bound below 1; 0 if it would be more than tenfold."""
         capped = np.maximum(self._each(own, other), math.log(GAIN))
         mean, scatter, n = float(capped.mean()), float(capped.std(ddof=1)), len(capped)
         for pieces in range(n + 1, 10 * n + 1):
@@ -171,8 +178,9 @@ class _HeldOut:
 
 
 def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int, most: int) -> _HeldOut:
-    """Windows of all recordings, shared evenly, with what is held out together: whole recordings that are alike in
-    kind, or blocks of a single one.
+    """Cut windows of all recordings, and form the groups that are held out together.
+
+    A group consists of similar recordings, or of parts of a single recording.
     """
     files = sorted({t.file for t in known})
     share = max(2 if len(files) > 1 else most, most // len(files))
@@ -216,7 +224,7 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
         0,
         np.zeros(len(of), dtype=np.int64),
     )
-    for recorded in present:  # a few recordings are pieces of evidence in blocks
+    for recorded in present:  # a few recordings are cut into blocks as pieces of evidence
         at = np.flatnonzero(recording == recorded)
         whole = len(at) * samples
         most = max(FEWEST / len(present), min(BLOCKS / len(present), whole / lasting))
@@ -240,10 +248,10 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
 
 
 def _by_kind(windows: OutputWindows, pieces: Places, present: Sequence[int]) -> list[int]:
-    """Recordings in the order of what differs most between them: mean and size of inputs, outputs and disturbances.
+    """Sort recordings along the first principal component of means and sizes of inputs, outputs and disturbances.
 
-    Neighbours are held out together, so that a group is of another kind than what is fitted: an inner choice flatters
-    where it is not.
+    Neighbours are held out together, so held-out recordings differ from the fitted ones. Otherwise the held-out error
+    would be too optimistic.
     """
     rows = []
     for piece in present:
@@ -261,7 +269,7 @@ def _by_kind(windows: OutputWindows, pieces: Places, present: Sequence[int]) -> 
 
 @dataclass
 class _Search:
-    """The search's recordings, and what it has computed."""
+    """Recordings of the search, and cached fits."""
 
     base: type[Prior]
     dt: float
@@ -281,7 +289,7 @@ class _Search:
         return self.fits[terms]
 
     def with_states(self, terms: Terms, points: Points) -> Points:
-        """Points with the terms' states: each where its signal is."""
+        """Points with the terms' states; each of these states equals its signal."""
         x, u, w = points
         prior = self.base()
         signals = {"rate": x, "input": u, "disturbance": w}
@@ -291,7 +299,7 @@ class _Search:
         return np.column_stack([x, *added]), u, w
 
     def problem(self, terms: Terms, windows: OutputWindows) -> Shooting:
-        """Windows that the prior with terms is fitted to."""
+        """Shooting problem for the fit of the prior with terms."""
         fit, sizes, first, known = self.fit(terms), self.sizes, windows.x, windows.known
         for term in _with_state(terms):
             own, size = self._first(term, windows)
@@ -301,7 +309,7 @@ class _Search:
         return Shooting(fit, replace(windows, x=first, known=known), sizes, self.spread)
 
     def _first(self, term: Term, windows: OutputWindows) -> tuple[Array, float]:
-        """First values ``(n,)`` of a term's state in windows, those of its signal, and its size."""
+        """Initial values ``(n,)`` of a term's state in windows (values of its signal), and its size."""
         k = _index(self.base, term)
         if term.place == "rate":
             return windows.x[:, k], float(self.sizes[k])
@@ -314,9 +322,10 @@ class _Search:
     def judged(
         self, by: _HeldOut, terms: Terms, theta: Array, keep: NDArray[np.bool_] | None = None
     ) -> Shooting:
-        """Windows that the prior with terms is judged by: the warm-up alone determines the first states, and the rest
-        counts. States of terms begin where they are along the recording: a free one would explain what the term
-        does not.
+        """Shooting problem for the evaluation of the prior with terms.
+
+        The warm-up only determines the initial states; errors are counted on the rest. The initial value of a term's
+        state follows from a simulation along the recording, since a free one could explain other effects.
         """
         some = np.ones(len(by.starts), dtype=bool) if keep is None else keep
         problem = self.problem(terms, replace(by.rows(some), warm=by.warm))
@@ -333,7 +342,7 @@ class _Search:
         return Shooting(problem.own, replace(windows, x=first, known=known), problem.sizes, self.spread)
 
     def _along(self, term: Term, trajectory: Trajectory, values: dict[str, float]) -> Array:
-        """A term's state along a recording ``(n,)``, from its signal at the first sample on."""
+        """Simulate a term's state along a recording ``(n,)``; it starts at the first value of its signal."""
         prior = self.base()
         x, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in ("x", "u", "w", "p"))
         state, given = ca.SX.sym("s"), ca.SX.sym("q", len(term.parameters))
@@ -372,7 +381,7 @@ class _Search:
         return np.concatenate([first.full().ravel(), found[:-1]])
 
     def held_out(self, terms: Terms, theta: Array) -> Array:
-        """Squared errors ``(n, T + 1)`` of every window by a fit to the other folds, each from ``theta`` on."""
+        """Squared errors ``(n, T + 1)`` of every window with a fit to the other folds, which starts from ``theta``."""
         squares = np.zeros(self.evidence.pieces.shape)
         for fold in sorted(set(self.evidence.folds.tolist())):
             held = self.evidence.folds == fold
@@ -381,16 +390,18 @@ class _Search:
         return squares
 
     def start(self, terms: Terms, theta: Array) -> Array:
-        """``theta`` of all terms from that of the first ones: the others begin at their nominal values."""
+        """``theta`` of all terms from that of the first ones; the others start at their nominal values."""
         return np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
 
     def by_short_windows(self, terms: Terms, start: Array) -> Array:
-        """A fit to the short windows."""
+        """Fit to the short windows."""
         return self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
 
     def begun(self, terms: Terms, theta: Array) -> Fitted:
-        """A fit to all windows from ``theta`` of the terms but the last ones: at once, and by way of short windows,
-        which lead further where long free runs go astray; the better one.
+        """Fit to all windows, from ``theta`` of the terms without the last ones.
+
+        Two starts: directly, and via a fit to short windows (long free runs have more local optima); the better result
+        is used.
         """
         start = self.start(terms, theta)
         problem = self.problem(terms, self.evidence.windows)
@@ -402,8 +413,9 @@ class _Search:
         return min(fits, key=lambda fit: problem.explained([fit.theta])[0])
 
     def untold(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
-        """Those of the new terms whose parameters all may be zero. Of a term with a state a weight and a time constant
-        are told together; there the held-out error alone decides.
+        """New terms whose weights are all insignificant.
+
+        For a term with a state, weight and time constant are identified together, so only the held-out error decides.
         """
         errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
         names, found = self.fit(terms).names, []
@@ -420,15 +432,16 @@ class _Search:
         return max(float(squares[self.evidence.counted].mean()), 1e-300)
 
     def without(self, terms: Terms, theta: Array, dropped: Term) -> tuple[Terms, Array]:
-        """The terms but one, and what is left of ``theta``."""
+        """The terms without one, and the remaining ``theta``."""
         kept = tuple(term for term in terms if term is not dropped)
         keep = [name not in dropped.names for name in self.fit(terms).names]
         return kept, theta[keep]
 
 
 class _Promises:
-    """What terms promise of the error over held-out data, to first order: by a Gauss-Newton step of all parameters and
-    first states in every fold.
+    """Predicted held-out error with additional terms, to first order.
+
+    One Gauss-Newton step of all parameters and initial states in every fold.
     """
 
     def __init__(
@@ -469,23 +482,23 @@ class _Promises:
         return max(cost, 1e-300)
 
     def of(self, *forms: int) -> float:
-        """Logarithm of the ratio of errors that these forms together promise."""
+        """Logarithm of the predicted ratio of errors with these forms together."""
         columns = [*self.present, *(place for form in forms for place in self.places[form])]
         return 0.5 * math.log(self._left(columns) / self.plain)
 
 
 def _with_state(terms: Sequence[Term]) -> list[Term]:
-    """Those with a state of their own, in order."""
+    """Terms with a state, in order."""
     return [term for term in terms if term.state is not None]
 
 
 def _vanishes(term: Term) -> bool:
-    """Whether a term does nothing at its nominal values, so that slopes tell what it would do."""
+    """Whether a term is zero at its nominal values, so that derivatives predict its effect."""
     return term.state is None and term.parameters[0].value == 0.0
 
 
 def _index(base: type[Prior], term: Term) -> int:
-    """Place of a term's signal among those of its kind."""
+    """Index of a term's signal among the signals of its kind."""
     groups: dict[str, tuple[Signal, ...]] = {
         "input": base.inputs, "disturbance": base.disturbances, "output": base.outputs,
     }  # fmt: skip
@@ -493,7 +506,7 @@ def _index(base: type[Prior], term: Term) -> int:
 
 
 def _step(normal: Array, columns: list[int], low: Array, high: Array) -> Array:
-    """The bounded Gauss-Newton step of some columns: those that would leave their bounds end there."""
+    """Bounded Gauss-Newton step of some columns; components that would leave their bounds are fixed there."""
     matrix, slope = normal[np.ix_(columns, columns)], normal[columns, -1]
     matrix = matrix + RIDGE * np.diag(np.diag(matrix) + 1e-300)
     step, free = np.zeros(len(columns)), np.ones(len(columns), dtype=bool)
@@ -511,8 +524,9 @@ def _step(normal: Array, columns: list[int], low: Array, high: Array) -> Array:
 
 
 def _squares(problem: Shooting, theta: Array) -> Array:
-    """Squared error ``(n, T + 1)`` of each sample of free runs, mean over the outputs of the error over its spread,
-    from the best first states; zero where nothing was measured.
+    """Squared error ``(n, T + 1)`` of each sample of free runs with the best initial states; zero without measurement.
+
+    Mean over the outputs of the squared error over the squared spread.
     """
     point = problem.start(theta, problem.first_states(theta), "")
     shape = problem.windows.y.shape
@@ -523,7 +537,7 @@ def _squares(problem: Shooting, theta: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Fitted:
-    """A candidate that was fitted in every fold."""
+    """A candidate after its fit in every fold."""
 
     forms: Terms
     held_out: HeldOutError | None
@@ -536,13 +550,13 @@ class _Fitted:
 
 @dataclass(frozen=True)
 class _Ranked:
-    """Candidates with the logarithm of the ratio of errors that they promise, over long windows and short ones."""
+    """Candidates with the logarithm of their predicted ratio of errors, over long windows and over short ones."""
 
     long: list[tuple[float, Terms]]
     short: list[tuple[float, Terms]]
 
     def best(self, count: int, beyond: _Ranked | None = None) -> list[Terms]:
-        """So many of both that promise most; only those that promise more than all of others do."""
+        """The ``count`` best candidates of both; only those that are better than all of ``beyond``."""
         found: list[Terms] = []
         others = ([], []) if beyond is None else (beyond.long, beyond.short)
         for own, other in zip((self.long, self.short), others, strict=True):
@@ -553,7 +567,7 @@ class _Ranked:
 
 @dataclass
 class _State:
-    """Where the search is: the terms, their fit, and the squared errors over held-out data."""
+    """State of the search: terms, their fit, and squared errors over held-out data."""
 
     terms: Terms
     theta: Array
@@ -579,22 +593,23 @@ def explain(
 
     Args:
         base: The prior's class.
-        values: Its fitted values [their units] by name.
+        values: Fitted values [their units] of the prior by name.
         known: Recordings with inputs that act and smoothed states (:func:`~hybrid_mpc.identify.fit.smoothed`).
         dt: Model period [s].
-        length: Length [s] of the free runs that models are judged by.
-        warm_up: Length [s] of the part of a held-out free run that alone determines its first state, and does not
-            count; as where models are evaluated. Default: the whole run does both.
-        candidates: Terms to choose from. Default: :func:`~hybrid_mpc.identify.term_library.library`.
-        own: A user's own terms beside these.
-        begun: What ``on_step`` had of a search with the same arguments that was stopped: it goes on from there.
-        most: Steps that add terms, at most.
+        length: Length [s] of the free runs that evaluate models.
+        warm_up: Length [s] of the first part of a held-out free run, which only determines its initial state; errors
+            are counted on the rest. Default 0: the whole run serves both.
+        candidates: Candidate terms. Default: :func:`~hybrid_mpc.identify.term_library.library`.
+        own: A user's additional terms. Default: none.
+        begun: The last value of ``on_step`` of an interrupted search with the same arguments, which is continued.
+            Default: a new search.
+        most: Maximum number of steps that add terms.
         on_progress: ``(done, total, text)`` after every fit of a step.
-        on_step: What is known after each step, for a file from which a stopped search goes on.
+        on_step: Receives the result after each step, for example to store it.
 
     Raises:
-        InputError: If there are too few recordings to judge terms by, two terms have one name, or an own term does not
-            fit to the prior, its units or its balances.
+        InputError: If there are too few recordings to evaluate terms, two terms have the same name, or a user's term
+            does not match the prior, its units or its balances.
     """
     found = _Explain(
         base=base,
@@ -611,7 +626,7 @@ def explain(
 
 
 class _Explain:
-    """One search."""
+    """A search: see :func:`explain`."""
 
     def __init__(
         self,
@@ -631,8 +646,8 @@ class _Explain:
         longest = min(periods_of(length, dt, 2), max(ends.values()))
         longest = min(
             end for end in ends.values() if 2 * end >= longest
-        )  # no recording is left out for being shorter
-        if len({t.file for t in known}) == 1:  # parts of a single recording are its evidence
+        )  # at least half the requested length, so that shorter recordings are used too
+        if len({t.file for t in known}) == 1:  # pieces of evidence are parts of the recording
             samples = sum(len(t.t) for t in known)
             longest = samples // BLOCKS - 1
             if longest < min(LEAST, periods_of(length, dt, 2)):
@@ -666,7 +681,7 @@ class _Explain:
     def run(
         self, begun: Explanation | None, most: int, on_step: Callable[[Explanation], None]
     ) -> Explanation:
-        """The whole search."""
+        """Run the whole search."""
         if begun is not None:
             self._resume(begun)
         last: tuple[Trial, ...] = ()
@@ -691,7 +706,7 @@ class _Explain:
         self.pool = [one for one in self.pool if not there & {form.name for form in one.forms}]
 
     def _step(self) -> tuple[tuple[Trial, ...], int, _Fitted | None]:
-        """Candidates that were fitted, the number of those that were scored, and what is added."""
+        """Run one step: fitted candidates, number of scored candidates, and the candidate to add."""
         number = 1 + sum(step.action == "added" for step in self.steps)
         singles, pairs, diverged = self._scored(number)
         fitted = list(self._fitted(singles.best(TRIED), f"step {number}"))
@@ -708,9 +723,7 @@ class _Explain:
         )
 
     def _scored(self, number: int) -> tuple[_Ranked, _Ranked, list[Trial]]:
-        """Single terms and pairs with the logarithm of the ratio of errors that they promise; and candidates whose fit
-        failed.
-        """
+        """Single terms and pairs with the logarithm of their predicted ratio of errors, and failed candidates."""
         search, now = self.search, self.now
         self.on_progress(0, len(self.pool), f"step {number}: {len(self.pool)} candidates are scored")
         plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if _vanishes(form)]
@@ -730,7 +743,9 @@ class _Explain:
         ends = search.error(now.terms, now.theta)
         diverged = []
         slow = [one for one in self.pool if not _vanishes(one.forms[0])]
-        for i, one in enumerate(slow, 1):  # at once a lag does what no slope tells
+        for i, one in enumerate(
+            slow, 1
+        ):  # a lag acts at its nominal values, so derivatives do not predict its effect
             scores = []
             for form in one.forms:
                 try:
@@ -753,7 +768,7 @@ class _Explain:
         return _Ranked(*lists), _Ranked(*pairs), diverged
 
     def _fitted(self, some: Sequence[Terms], text: str) -> Iterator[_Fitted]:
-        """Candidates, fitted in every fold and judged."""
+        """Fit candidates in every fold and evaluate them."""
         search, now = self.search, self.now
         ends = search.error(now.terms, now.theta)
         for done, forms in enumerate(some):
@@ -798,7 +813,7 @@ class _Explain:
         return _Fitted(forms, found, theta, squares, reason, not reason)
 
     def _at_bounds(self, forms: Terms, theta: Array) -> list[str]:
-        """Parameters of new terms that end at a bound: the law then stands for something else."""
+        """Parameters of new terms that end at a bound; such a term replaces another effect."""
         fit = self.search.fit((*self.now.terms, *forms))
         own, values = {name for form in forms for name in form.names}, fit.values(theta)
         fitted = [
@@ -809,7 +824,7 @@ class _Explain:
         return [p.name for p in fitted if p.at_bound]
 
     def _both_needed(self, pair: _Fitted) -> bool:
-        """Whether each term of a pair lowers the error beside the other."""
+        """Whether each term of a pair reduces the error in addition to the other."""
         if not pair.sure:
             return False
         terms = (*self.now.terms, *pair.forms)
@@ -848,7 +863,7 @@ class _Explain:
         self.pool = [one for one in self.pool if not added & {form.name for form in one.forms}]
 
     def _remove(self) -> None:
-        """Remove the terms that the newest ones made needless, one after the other."""
+        """Remove terms that the newest ones made superfluous, one after the other."""
         newest = {term.name for term in self.steps[-1].terms}
         while len(self.now.terms) > len(newest):
             least: tuple[HeldOutError, Term, _State] | None = None
@@ -870,7 +885,7 @@ class _Explain:
             self.steps.append(ExplainStep("removed", (_found(term),), found, own, 0))
 
     def _parameters(self, terms: Terms, theta: Array) -> tuple[FittedParameter, ...]:
-        """Values with standard errors of all parameters, after a last fit to all windows."""
+        """Values and standard errors of all parameters, after a final fit to all windows."""
         fit = self.search.fit(terms)
         last = self.search.problem(terms, self.evidence.windows).solve(theta, ITERATIONS)
         sizes = (
@@ -921,13 +936,13 @@ class _Explain:
 
 
 def _chosen(fitted: Sequence[_Fitted]) -> _Fitted | None:
-    """The candidate of the lowest expected logarithm of the error, of those that surely lower it."""
+    """Select the candidate with the lowest mean logarithm of the ratio, of those with a significant reduction."""
     sure = [one for one in fitted if one.sure]
     return min(sure, key=lambda one: one.held_out.ratio if one.held_out else math.inf, default=None)
 
 
 def _reason(trials: Sequence[Trial], pieces: int) -> str:
-    """Why the search ends."""
+    """Reason why the search ends."""
     judged = [trial for trial in trials if trial.held_out is not None]
     if not judged:
         return "no other term promises to lower the error"
@@ -942,10 +957,10 @@ def _found(term: Term) -> FoundTerm:
 
 
 def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points: Points) -> None:
-    """Refuse two terms of one name, and own terms that do not fit to the prior.
+    """Check that names are unique, and that a user's terms match the prior.
 
     Raises:
-        InputError: With all that does not.
+        InputError: If not; lists all errors together.
     """
     names = [name for one in pool for name in {form.name for form in one.forms}]
     parameters = [name for one in pool for form in one.forms for name in form.names]
@@ -965,7 +980,7 @@ def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points:
 
 
 def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> list[str]:
-    """Why a term that is declared a loss is none: it supplies where the recordings go."""
+    """Errors of a term that is declared a loss but supplies to a balance at some of the recordings' points."""
     given = tuple(v.T for v in points)
     values = {p.name: p.upper if math.isfinite(p.upper) else p.value or 1.0 for p in term.parameters}
     full = made({**prior.values, **values})
@@ -1003,7 +1018,7 @@ class _Pictures:
         self.n_p = len(plain.parameters)
 
     def of(self, term: Term) -> TermPicture | None:
-        """The picture of one term; None where it has a state of its own, so that no curve shows it."""
+        """Picture of one term; None for a term with a state, which is not a curve."""
         if term.state is not None:
             return None
         places = [k for k, p in enumerate(self.parameters) if p.name in term.names]
@@ -1031,7 +1046,7 @@ class _Pictures:
         raise KeyError(name)
 
     def _over(self, term: Term) -> tuple[Array, str]:
-        """What a term is drawn over."""
+        """Values and label of the horizontal axis."""
         if term.place == "output":
             k = _index(self.base, term)
             return self._shown(without=term)[:, k], self.base.outputs[k].label
@@ -1069,7 +1084,7 @@ class _Pictures:
         return np.asarray(self.prior.equations.xdot(self.x.T, self.u.T, self.w.T, values).full().T)[:, :n_x]
 
     def _as_force(self, rates: Array, term: Term) -> Array:
-        """Rates as a force on the term's axis where it adds one, else the rate of its state."""
+        """Convert rates to a force on the term's axis if the term is a force; else return the rate of its state."""
         k = _index(self.base, term)
         if term.place == "rate" or self.masses is None:
             return rates[:, k]
@@ -1080,7 +1095,7 @@ class _Pictures:
         return found
 
     def _added(self, term: Term, values: Array) -> Array:
-        """What a term adds at every point ``(n,)``."""
+        """Value of a term at every point ``(n,)``."""
         zero = self._zeroed(term, values)
         if term.place == "output":
             k = _index(self.base, term)
@@ -1101,7 +1116,7 @@ class _Pictures:
         return self._as_force(self._rates(values) - self._rates(zero), term)
 
     def _left(self, term: Term) -> Array | None:
-        """What the model leaves where the term acts ``(n,)``; None where nothing shows it."""
+        """Residual of the model at the term's place ``(n,)``; None for terms of inputs and disturbances."""
         if term.place in ("input", "disturbance"):
             return None
         if term.place == "output":

@@ -30,18 +30,18 @@ ITERATIONS = 25
 FIRST = 4
 """Maximum steps before outputs and outliers are weighted by their residuals."""
 LOOSELY = 1e-2
-"""Weight of an initial state's distance from its guess, over its size, with errors in spreads. It is small because the
-guess of a wrong nominal prior is far off, and errors are far below the spread once the initial states fit."""
+"""Weight of an initial state's distance from its guess, over its size, with errors in spreads. It is small: a wrong
+nominal prior gives poor guesses, and errors are far below the spread if the initial states fit."""
 ROUNDING = 1e-12
-"""Relative increase of the diagonal of the normal equations, so that initial states with equal effects stay solvable."""
+"""Relative increase of the diagonal of the normal equations: initial states with equal effects stay solvable."""
 STEEP = 1e8
 """Limit of a derivative, in spreads of the output per size of an initial state or parameter. Larger derivatives belong
 to a diverging run and are ignored."""
 OUTLIERS = 3.0
 """Residual, in robust standard deviations, above which the loss is linear instead of quadratic."""
 COMMON = 0.7
-"""Minimum of the robust standard deviation of an output's errors, over their root mean square without gross outliers. So
-large errors during a part of the time, from a wrong prior, are no outliers."""
+"""Minimum of the robust standard deviation of an output's errors, over their root mean square without gross outliers.
+So large errors during a part of the time, from a wrong prior, are no outliers."""
 GROSS = 10.0
 """Residual, in robust standard deviations, above which a sample is left out at the end of a fit."""
 SCALINGS = 4
@@ -306,7 +306,7 @@ class Shooting:
         self._known.clear()
 
     def shift(self, theta: Array, substeps: int) -> Array:
-        """Change of ``theta`` by a Gauss-Newton step due to the outputs' change with ``substeps`` sub-steps a period."""
+        """Change of ``theta`` by a Gauss-Newton step if the outputs are computed with other ``substeps``."""
         point = self.start(theta, self.first_states(theta), "all")
         point = replace(point, scale=self._left(point.error), held=1.0)
         finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
@@ -392,7 +392,7 @@ class Shooting:
         return np.maximum(robust, 1e-9 * self.spread)
 
     def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
-        """Initial states for a given ``theta``: Levenberg-Marquardt steps in each group of windows, until convergence."""
+        """Initial states for a given ``theta``: Levenberg-Marquardt steps in each group of windows."""
         cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
         damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
         for _ in range(steps):

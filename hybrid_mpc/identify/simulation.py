@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 MAX_SUBSTEPS = 20
 """Maximum Runge-Kutta sub-steps a period; a stiffer prior needs a smaller dt."""
 USUALLY = 0.98
-"""Share of the samples at which a prior must not be too stiff. At the others, such as the square root of an empty tank's
-level, the integration is less accurate."""
+"""Share of the samples at which a prior must not be too stiff. At the others, such as near the square root of an empty
+tank's level, the integration is less accurate."""
 VISITED = 200
 """Number of samples of the recordings at which the stiffness is computed, besides the extreme ones."""
 CHAINED = 20

@@ -1,4 +1,4 @@
-"""Smoothing of measured outputs with the prior's own equations: states, measured or not, that know the inputs."""
+"""Smoothing of measured outputs with the prior's equations: estimates of measured and unmeasured states."""
 
 from __future__ import annotations
 
@@ -29,60 +29,59 @@ from hybrid_mpc.machine.prior import Equations, Prior
 
 Array = NDArray[np.float64]
 STILL = 0.01
-"""A trajectory whose estimates move by less than this share of their standard deviations is smoothed."""
+"""Last Newton step, over the states' sizes, below which an equilibrium has converged."""
 NEWTON = 15
 """Newton steps to the equilibrium of the first inputs."""
 DECADES = (-6.0, 2.0)
-"""Range searched for the walk of the unexplained rates, as a power of ten of their natural size: from a prior that is
-right to one that explains nothing."""
+"""Searched range of the walk of the unexplained rates, as a power of ten of their natural size: from an exact prior to
+a prior that explains nothing."""
 AT_ONCE, NARROW = 15, 0.1
-"""Walks tried at once, and the distance [powers of ten] to the next ones at which the best is near enough."""
+"""Number of walks that are tried at once, and the resolution [powers of ten] at which the search ends."""
 ALIKE = 0.5
-"""Share of the longest one's length from which on trajectories are run beside it."""
+"""Minimum ratio of lengths of trajectories that run in one batch."""
 ROUGH = -0.5
-"""Walk, as a power of ten, of a prior that is not fitted yet."""
+"""Walk, as a power of ten, for a prior that is not fitted yet."""
 IGNORANCE = 10.0
-"""Standard deviation of a state that is not known at first, as a multiple of its natural size; half its range at
-most."""
+"""Standard deviation of an unknown initial state over its natural size; at most half its range."""
 SAMPLE = 12
-"""At most so many trajectories decide the noise levels."""
+"""Maximum number of trajectories for the estimation of the noise levels."""
 FADING = 10.0
-"""Machine's seconds in which an unexplained rate fades that nothing tells of: without, what it drives would drift
-away."""
+"""Time constant [time units] with which an unexplained rate decays without data. Without decay, the state that it
+drives would drift away."""
 GROWN = 10.0
-"""Growth up to which the outputs of a machine that runs away tell its states' sizes."""
+"""Growth of a small error that limits the time over which the states' sizes of an unstable machine are computed."""
 QUIETEST = 1e-6
-"""Least noise of a sensor, as a share of the spread of its output: recordings of a simulation may have none, and what
-is not known at first is some 10 spreads, whose square holds no more digits."""
+"""Minimum noise of a sensor over the spread of its output. Simulated recordings can be free of noise. Unknown initial
+states have a standard deviation of about 10 spreads, so the squares of the two span all digits."""
 SLACK = 0.1
-"""What the states may leave their equations by over the machine's time unit, as a share of what shows as the sensors'
-noise: too little to be seen, enough for the problem to be well conditioned. All else that is not explained is ``d``."""
+"""Process noise of the states' equations over the machine's time unit, over the sensors' noise. It is too small to be
+visible and large enough for a well-conditioned problem. All other unexplained effects are in ``d``."""
 UNSEEN = 1e-6
-"""Share of the outputs' spread below which a state's whole range shows in no output."""
+"""Share of the outputs' spread below which the effect of a state's whole range counts as unobservable."""
 
 
 @dataclass(frozen=True)
 class Smoother:
-    """The most likely ``(x, d)`` of recordings: ``d`` is what the prior does not explain of the rates that it corrects.
+    """Smoother: most likely ``(x, d)`` of recordings, with unexplained rates ``d`` of the corrected states.
 
-    ``x_{k+1} = f(x_k, u_k, w_k, d_k)`` is the prior integrated over a period with ``d_k`` held, ``d`` walks at random,
-    ``y_k = g(x_k, u_k, w_k) + noise``; all samples of a recording are estimated together
-    (:class:`~hybrid_mpc.identify.horizon.Horizon`). Where nothing that is measured tells of ``d``, it fades
-    (``fading``). So states that no sensor sees are estimated, and the input's part of a motion is known where a local
-    polynomial would smear it. States stay within thrice their ranges. Missing samples (NaN) of single outputs are
-    passed over; a censored one counts only where the estimate contradicts it; one that lies far off counts by its size
-    alone.
+    Model: ``x_{k+1} = f(x_k, u_k, w_k, d_k)`` is the prior integrated over a period with constant ``d_k``; ``d`` is a
+    random walk that decays by ``fading``; ``y_k = g(x_k, u_k, w_k) + noise``. All samples of a recording are estimated
+    together (:class:`~hybrid_mpc.identify.horizon.Horizon`). So unmeasured states are estimated, and responses to
+    inputs are not smeared as by a local polynomial.
+
+    States stay within three times their ranges. Missing samples (NaN) are skipped. A censored sample counts only if the
+    estimate contradicts it. The loss of an outlier is linear.
 
     Args:
         prior: The fitted prior.
         dt: Period [s].
         sigma: Standard deviation of the measurement ``(n_y,)`` [output units].
-        walk: Standard deviation of d's change per period ``(n_d,)`` [units of the corrected rates].
+        walk: Standard deviation of the change of d in one period ``(n_d,)`` [units of the corrected rates].
         sizes: Natural sizes of the signals (:func:`sizes_of`).
-        fading: What is left of ``d`` after a period [-].
+        fading: Decay factor of ``d`` in one period [-]. Default: 1, no decay.
         substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
 
-    Source: as for the horizon; the filter that starts it and whose innovations tell the noise: Jazwinski, *Stochastic
+    Source: as for the horizon; for the filter that gives its start and the innovations: Jazwinski, *Stochastic
     processes and filtering theory* (1970), section 8.3.
     """
 
@@ -95,7 +94,7 @@ class Smoother:
     substeps: int = 0
 
     def smooth(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-        """Every trajectory with ``x`` and ``xdot`` from all of its own samples and from nothing outside it."""
+        """Estimate ``x`` and ``xdot`` of every trajectory from its own samples."""
         smoothed: dict[int, Trajectory] = {}
         for group in _together(trajectories):
             for (i, t), z in zip(group.items(), self._estimate(list(group.values())), strict=True):
@@ -103,9 +102,9 @@ class Smoother:
         return [smoothed[i] for i in range(len(trajectories))]
 
     def innovations(self, trajectories: Sequence[Trajectory]) -> tuple[float, float, int]:
-        """Squared innovations over their variances, the logarithms of these variances, and how many there are.
+        """Sum of squared innovations over their variances, sum of log determinants, and number of innovations.
 
-        They are those of a filter that starts in ignorance; the samples that end it do not count.
+        The filter starts with a large covariance; the first samples, which reduce it, are not counted.
         """
         return _innovations([self], trajectories)[0]
 
@@ -131,9 +130,7 @@ class Smoother:
         return replace(trajectory, x=x, xdot=xdot)
 
     def _estimate(self, group: Sequence[Trajectory]) -> list[Array]:
-        """Most likely ``(x, d)`` ``(n, n_z)`` of trajectories, from what of the filter's estimates and the first states
-        explains them better.
-        """
+        """Most likely ``(x, d)`` ``(n, n_z)``; the starts are the filter's estimates and constant states."""
         runs, lengths = _Runs.of(self, group), [len(t.t) for t in group]
         begins = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.intp)
         y, censored, u, w = (
@@ -149,7 +146,7 @@ class Smoother:
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Bounds of the states ``(n_x,)``: thrice their ranges; none of an angle that may turn through."""
+        """Bounds of the states ``(n_x,)``: three times their ranges; none for an angle that can turn fully."""
         low, high = (np.array([getattr(s, end) for s in self.prior.states]) for end in ("lower", "upper"))
         beyond = np.where([s.periodic for s in self.prior.states], np.inf, high - low)
         bounded = np.isfinite(beyond)
@@ -180,9 +177,9 @@ class Smoother:
         )
 
     def _ignorance(self, walk: Array) -> Array:
-        """Standard deviations ``(..., n_z)`` of the first ``(x, d)``, by the walk ``(..., n_d)``."""
+        """Standard deviations ``(..., n_z)`` of the initial ``(x, d)``, for the walk ``(..., n_d)``."""
         if self.fading < 1.0:
-            settled = walk / math.sqrt(1.0 - self.fading**2)  # of d, when it has long walked
+            settled = walk / math.sqrt(1.0 - self.fading**2)  # stationary standard deviation of d
         else:
             own = IGNORANCE * np.array([self.sizes.rate[i] for i in self.prior.corrected])
             settled = np.broadcast_to(own, walk.shape)
@@ -191,10 +188,11 @@ class Smoother:
         return np.concatenate([np.broadcast_to(known, (*walk.shape[:-1], len(known))), settled], axis=-1)
 
     def prediction_errors(self, trajectories: Sequence[Trajectory], p: Array) -> tuple[Array, list[Array]]:
-        """Prediction errors of the filter for several sets of parameters ``(m, n_p)``.
+        """One-step prediction errors of the filter for several sets of parameters ``(m, n_p)``.
 
-        Gives them one behind the other, each over the standard deviation that the first set gives it, ``(m, N)``; and
-        those of the first set by trajectory, ``(n, n_y)``, as they are.
+        Returns:
+            Errors of all trajectories, joined, over the standard deviations of the first set, ``(m, N)``; and the
+            unscaled errors of the first set by trajectory, ``(n, n_y)``.
         """
         every: list[Array] = []
         own: dict[int, Array] = {}
@@ -217,10 +215,10 @@ class Smoother:
         p: Array | None = None,
         levels: tuple[Array, Array] | None = None,
     ) -> _Filtered:
-        """What the filter finds.
+        """Run the filter.
 
-        Parameters are the prior's, or ``p`` ``(b, n_p)``; noise and walk are the smoother's own, or those of each run
-        in ``levels`` ``(b, n_y)``, ``(b, n_d)``.
+        Parameters are the prior's, or ``p`` ``(b, n_p)``. Noise and walk are the smoother's, or those of each run in
+        ``levels``, ``(b, n_y)`` and ``(b, n_d)``.
         """
         b, n_z, n_x = len(runs.y), self._n_z, len(self.prior.states)
         sigma, walk = (np.broadcast_to(v, (b, np.shape(v)[-1])) for v in levels or (self.sigma, self.walk))
@@ -243,11 +241,10 @@ class Smoother:
         return _Filtered(counts[..., 0] > 0, now[..., 0], e[..., 0], s)
 
     def _starts(self, trajectories: Sequence[Trajectory]) -> Array:
-        """States ``(b, n_x)`` at the first samples: nearest to where the first inputs would hold the machine, in their
-        sizes, of those that explain what is measured.
+        """Initial states ``(b, n_x)``: of the states that match the measurement, the nearest to the equilibrium.
 
-        That is the stable equilibrium of the first inputs, or where there is none, rest. It decides between states that
-        a sensor cannot tell apart, as the sign of a speed of which it shows the size.
+        The equilibrium is the stable one of the first inputs; without it, rest. The distance is in the states' sizes.
+        This resolves ambiguous sensors, for example a sensor that shows the size of a speed without its sign.
         """
         n, rest = len(trajectories), rest_of(self.prior)
         u, w = (
@@ -290,16 +287,14 @@ class Smoother:
 
 
 def _first_seen(y: Array) -> Array:
-    """First sample of each output that is there."""
+    """First measured sample of each output."""
     there = np.isfinite(y)
     return np.array([c[h][0] if h.any() else np.nan for c, h in zip(y.T, there.T, strict=True)])
 
 
 @dataclass(frozen=True)
 class _Runs:
-    """Trajectories side by side, ``(b, n, ...)``; behind its end one goes on with its last sample, of which nothing is
-    seen.
-    """
+    """Parallel trajectories ``(b, n, ...)``; a shorter one repeats its last sample, without measurements."""
 
     y: Array
     seen: Array
@@ -311,7 +306,7 @@ class _Runs:
 
     @classmethod
     def of(cls, smoother: Smoother, group: Sequence[Trajectory]) -> _Runs:
-        """Trajectories with the states that the smoother starts from."""
+        """Stack trajectories, with the smoother's initial states."""
         lengths = tuple(len(t.t) for t in group)
         index = np.minimum(np.arange(max(lengths)), np.array(lengths)[:, None] - 1)
         y, censored, u, w = (
@@ -324,11 +319,11 @@ class _Runs:
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """Which samples are a trajectory's own ``(b, n)``."""
+        """Mask of the trajectories' own samples ``(b, n)``."""
         return np.asarray(np.arange(self.y.shape[1]) < np.array(self.lengths)[:, None])
 
     def times(self, m: int) -> _Runs:
-        """The same runs, ``m`` times one behind the other."""
+        """Repeat the runs ``m`` times, one behind the other."""
         own = (
             np.concatenate([v] * m) for v in (self.y, self.seen, self.censored, self.u, self.w, self.first)
         )
@@ -340,7 +335,7 @@ class _Runs:
 class _Filtered:
     """A filter's results for ``b`` runs of ``n`` samples: estimates, innovations and their covariances.
 
-    ``counted`` are the samples that are there, without the censored ones that nothing contradicts.
+    ``counted`` are the measured samples, without censored samples that the estimate does not contradict.
     """
 
     counted: NDArray[np.bool_]
@@ -352,7 +347,7 @@ class _Filtered:
 def _innovations(
     smoothers: Sequence[Smoother], trajectories: Sequence[Trajectory]
 ) -> list[tuple[float, float, int]]:
-    """:meth:`Smoother.innovations` of smoothers that differ in noise and walk alone."""
+    """:meth:`Smoother.innovations` of smoothers that differ only in noise and walk."""
     one, m = smoothers[0], len(smoothers)
     squares, logs, count = np.zeros(m), np.zeros(m), np.zeros(m)
     for group in _together(trajectories):
@@ -366,7 +361,7 @@ def _innovations(
         counts = runs.inside & (np.arange(runs.y.shape[1]) >= skip[:, None])
         e, s, counted = (v.reshape(m, b, *v.shape[1:])[:, counts] for v in (found.e, found.s, found.counted))
         squares += np.sum(e * np.linalg.solve(s, e[..., None])[..., 0], axis=(1, 2))
-        # a filter that diverged has no determinant; its cost is not finite, and it is passed over
+        # a diverged filter has no determinant; its cost is not finite, so it is not selected
         with np.errstate(invalid="ignore"):
             logs += np.linalg.slogdet(s)[1].sum(axis=1)
         count += counted.sum(axis=(1, 2))
@@ -381,18 +376,17 @@ def fit_smoother(
     time_unit: float | None = None,
     substeps: int | None = None,
 ) -> Smoother:
-    """Smoother whose noise and walk make the measurements most likely.
+    """Estimate noise and walk of a smoother by maximum likelihood of the measurements.
 
-    The ratio of walk to noise is searched, the noise's scale follows in closed form. Several outputs keep the ratio of
-    noises that their third differences show, several walks that of the natural sizes of the rates.
+    The ratio of walk to noise is searched; the scale of the noise follows in closed form. Ratios between outputs are
+    those of their third differences. Ratios between walks are those of the rates' natural sizes.
 
     Args:
         prior: The fitted prior.
         trajectories: Recordings; at most ``SAMPLE`` of them, evenly chosen, are used.
         dt: Period [s].
         time_unit: The machine's time unit [s]. Default: that of the trajectories.
-        substeps: Runge-Kutta sub-steps a period. Default: as many as the prior needs where the trajectories go, as far
-            as they hold states.
+        substeps: Runge-Kutta sub-steps a period. Default: as many as the prior needs along the trajectories' states.
     """
     if substeps is None:
         substeps = required_substeps(prior, dt, visited(trajectories))
@@ -407,12 +401,14 @@ def fit_smoother(
         return np.where(np.isfinite(values), values, 1e300)
 
     best, width = 0.5 * (DECADES[0] + DECADES[1]), 0.5 * (DECADES[1] - DECADES[0])
-    while width > NARROW:  # several at once cost little more than one
+    while width > NARROW:  # several walks at once cost little more than one
         ratios = np.clip(best + width * np.linspace(-1.0, 1.0, AT_ONCE), *DECADES)
         best, width = float(ratios[np.argmin(costs(ratios))]), 2 * width / (AT_ONCE - 1)
     ((squares, _, count),) = _innovations([at(best)], sample)
     sizes = at(best).sizes
-    spreads = np.array(sizes.y) / np.array(sizes.noise)  # a sensor's noise is no larger than what it shows
+    spreads = np.array(sizes.y) / np.array(
+        sizes.noise
+    )  # a sensor's noise is at most the spread of its output
     return at(
         best, float(np.clip(math.sqrt(squares / max(count, 1)), QUIETEST * spreads.max(), spreads.max()))
     )
@@ -421,9 +417,9 @@ def fit_smoother(
 def rough_smoother(
     prior: Prior, trajectories: Sequence[Trajectory], dt: float, *, time_unit: float
 ) -> Smoother:
-    """Smoother of a prior that is not fitted yet: its rates may be wrong by a good part of their size.
+    """Smoother for a prior that is not fitted yet, whose rates may have large errors.
 
-    Arguments as for :func:`fit_smoother`; nothing is searched.
+    Arguments as for :func:`fit_smoother`; there is no search.
     """
     return _smoothers(prior, trajectories, dt, time_unit, required_substeps(prior, dt))(ROUGH, 1.0)
 
@@ -444,7 +440,7 @@ def _smoothers(
 
 
 def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_unit: float) -> Sizes:
-    """Natural sizes of a machine's signals, from recordings and the prior linearized at rest."""
+    """Compute natural sizes of a machine's signals, from recordings and the prior linearized at rest."""
     y = np.concatenate([t.y for t in trajectories])
     spread = np.array([robust_spread(c) for c in y.T])
     spread = np.where(spread > 0, spread, 1.0)
@@ -452,7 +448,7 @@ def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_u
     seen = seen_by(prior, dt, time_unit) / spread[:, None, None]
     size = np.sqrt(
         np.mean(np.sum(np.square(seen), axis=0), axis=0)
-    )  # of the outputs, for one unit of each state
+    )  # effect of one unit of each state on the outputs, in spreads
     ranges = np.array([s.upper - s.lower for s in prior.states])
     x = np.minimum(1.0 / np.maximum(size, 1e-300), np.where(np.isfinite(ranges), ranges, math.inf))
     unknown = ~np.isfinite(x) | (x > 1e200)
@@ -461,12 +457,11 @@ def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_u
 
 
 def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
-    """How each state at a time shows in each output over the machine's time unit after it ``(n_y, n, n_x)``.
+    """Effect of each state on each output over the machine's time unit, ``C exp(A t)``, ``(n_y, n, n_x)``.
 
-    Where the machine runs away it is the time, if that is shorter, in which what is small grows by ``GROWN``.
-
-    The prior is linearized at rest (:func:`~hybrid_mpc.identify.simulation.rest_of`) and a little beside it, since a
-    sensor may be blind at one point: ``|v|`` at rest.
+    On an unstable machine, the time is at most that in which a small error grows by ``GROWN``. The prior is linearized
+    at rest (:func:`~hybrid_mpc.identify.simulation.rest_of`) and at a second point, because a sensor can be insensitive
+    at one point (``|v|`` at rest).
     """
     x, u, w = rest_of(prior)
     ranges = np.array([s.upper - s.lower for s in prior.states])
@@ -480,10 +475,10 @@ def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
             continue
         rate = float(np.linalg.eigvals(a).real.max(initial=0.0))
         periods = max(2, round(min(time_unit, math.log(GROWN) / rate if rate > 0 else math.inf) / dt))
-        skip = max(1, periods // 50)  # fifty instants tell as much as a thousand
-        with np.errstate(over="ignore", invalid="ignore"):  # a mode that runs away hides all others
+        skip = max(1, periods // 50)  # fifty instants are enough
+        with np.errstate(over="ignore", invalid="ignore"):  # fast unstable modes overflow
             step, rows, at = expm(a * dt * skip), [], np.eye(len(x))
-        with np.errstate(over="ignore", invalid="ignore"):  # what runs away is cut off below
+        with np.errstate(over="ignore", invalid="ignore"):  # overflow is clipped below
             for _ in range(0, periods, skip):
                 at = at @ step
                 rows.append(c @ at)
@@ -494,9 +489,9 @@ def seen_by(prior: Prior, dt: float, time_unit: float) -> Array:
 
 
 def unseen_states(prior: Prior, dt: float, time_unit: float) -> list[str]:
-    """Names of the states that no output tells of: alone, or together with others.
+    """Names of the states that are not observable, alone or in combination with others.
 
-    States are scaled by their ranges, outputs by what all states together make of them.
+    States are scaled by their ranges, outputs by the effect of all states.
     """
     seen = seen_by(prior, dt, time_unit)
     ranges = np.array([s.upper - s.lower for s in prior.states])
@@ -515,7 +510,10 @@ def unseen_states(prior: Prior, dt: float, time_unit: float) -> list[str]:
 
 
 def _noise(trajectories: Sequence[Trajectory]) -> Array:
-    """Standard deviation ``(n_y,)`` of the sensors' noise, from third differences of the samples that are there."""
+    """Standard deviation ``(n_y,)`` of the sensors' noise, from third differences of the measured samples.
+
+    The third difference ``[1, -3, 3, -1]`` of white noise has 20 times its variance.
+    """
     found = []
     for j in range(trajectories[0].y.shape[1]):
         columns = [t.y[np.isfinite(t.y[:, j]), j] for t in trajectories]
@@ -525,7 +523,7 @@ def _noise(trajectories: Sequence[Trajectory]) -> Array:
 
 
 def _together(trajectories: Iterable[Trajectory]) -> list[dict[int, Trajectory]]:
-    """Trajectories of about the same length together, each under its place in the order given."""
+    """Group trajectories of similar length; each keeps its index in the given order."""
     groups: list[dict[int, Trajectory]] = []
     longest = 0
     for i, t in sorted(enumerate(trajectories), key=lambda pair: -len(pair[1].t)):
@@ -554,11 +552,11 @@ def _filter(
     fading: float,
     bounds: tuple[tuple[float, ...], tuple[float, ...]],
 ) -> ca.Function:
-    """A period of the extended Kalman filter, whose expectations stay within bounds.
+    """One period of the extended Kalman filter, with estimates clipped to bounds.
 
-    Takes what is expected ``[z, P]``, a sample ``y``, which outputs were seen, which are censored, ``u, w``, ``p``,
-    variances of the noise and of the walk. Gives what is expected of the next sample, the estimate, the innovation with
-    its covariance, and which samples counted.
+    Arguments: prediction ``[z, P]``, sample ``y``, masks of measured and of censored outputs, ``u, w``, ``p``,
+    variances of noise and walk. Results: prediction of the next sample, estimate, innovation and its covariance, mask
+    of counted outputs.
     """
     xdot = with_unknown_rates(equations.xdot, corrected)
     n_x, n_z, n_y = equations.xdot.size1_in(0), xdot.size1_in(0), equations.output.size1_out(0)
@@ -570,12 +568,12 @@ def _filter(
     r, noise = ca.SX.sym("r", n_y), ca.SX.sym("noise", n_z)
     z, covariance = ahead[:, 0], ahead[:, 1:]
     expected = equations.output(z[:n_x], u, w, p)
-    # a censored sample counts where the estimate lies on the measured side of its limit
+    # a censored sample counts only if the estimate lies within the sensor's range
     counts = seen * (1 - ca.logic_and(censored != 0, censored * (expected - y) > 0))
     e, c = counts * (y - expected), ca.diag(counts) @ ca.jacobian(expected, z)
     s = c @ covariance @ c.T + ca.diag(counts * r + (1 - counts))
     gain = ca.solve(s, c @ covariance).T if n_y > 1 else (covariance @ c.T) / s
-    rest = ca.SX.eye(n_z) - gain @ c  # Joseph's form: rounding leaves no variance negative
+    rest = ca.SX.eye(n_z) - gain @ c  # Joseph form: rounding makes no variance negative
     after = rest @ covariance @ rest.T + gain @ ca.diag(counts * r) @ gain.T
     after = 0.5 * (after + after.T)
     now = ca.SX.sym("now", n_z)
@@ -591,7 +589,7 @@ def _filter(
 
 
 def _between(z: ca.SX, lower: tuple[float, ...], upper: tuple[float, ...]) -> ca.SX:
-    """``z``, of which the first components have bounds."""
+    """Clip the first components of ``z`` to their bounds."""
     bounded = [
         ca.fmin(ca.fmax(z[i], low), high) if math.isfinite(low) and math.isfinite(high) else z[i]
         for i, (low, high) in enumerate(zip(lower, upper, strict=True))

@@ -1,4 +1,4 @@
-"""Start values of a fit: nominal values and points between the bounds, those that explain the windows best first."""
+"""Start values of a fit: nominal values and points between the bounds, sorted by their error over the windows."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from hybrid_mpc.identify.shooting import Shooting
 
 Array = NDArray[np.float64]
 STARTS = 6
-"""Starts between the bounds that are tried over the shortest windows, beside the nominal values."""
+"""Number of starts between the bounds over the shortest windows, besides the nominal values."""
 START_ITERATIONS = 6
-"""Gauss-Newton steps from each start before the best is taken on."""
+"""Gauss-Newton steps from each start before the best ones are selected."""
 POOR = 0.3
-"""What is left of the outputs' spread from which on the longest windows are fitted from every start."""
+"""Error, over the outputs' spread, above which the longest windows are fitted from every start."""
 FOLLOWED = 3
-"""Starts at most that are followed from one length to the next, where the best alone may be a wrong optimum."""
+"""Maximum number of starts that are followed from one length to the next, because the best may be a wrong optimum."""
 PROMISING = 1.5
 """Ratio to the least error up to which another start is followed."""
 DISTINCT, FACTOR = 0.1, 3.0
-"""Share of a parameter's half range, or this many times that share of its value, by which starts that are followed
-differ in one of them at least."""
+"""Followed starts differ in at least one parameter by more than ``DISTINCT`` half ranges, or by more than ``DISTINCT *
+FACTOR`` of its value."""
 
 
 def promising_starts(
     fit: OutputFit, short: Shooting, long: Shooting, start: Mapping[str, float] | None
 ) -> list[Array]:
-    """Parameters after a few steps over short windows from several starts, the best over long windows first."""
+    """Parameters after a few steps over short windows from several starts, sorted by their error over long windows."""
     found = []
     for one in [fit.nominal, *([] if start is None else [fit.scaled(start)]), *_draws(fit)]:
         try:
@@ -43,13 +43,13 @@ def promising_starts(
 
 
 def _draws(fit: OutputFit) -> list[Array]:
-    """Starts between the bounds."""
+    """Starts between the bounds (a Sobol sequence)."""
     between = qmc.Sobol(len(fit.nominal), seed=0).random_base2(3)[:STARTS]
     return list(fit.lower + between * (fit.upper - fit.lower))
 
 
 def further_starts(fit: OutputFit, problem: Shooting, solved: Sequence[Fitted]) -> list[Fitted]:
-    """Fits from the nominal values and from draws, one after the other, until one leaves less than ``POOR``."""
+    """Fits from the nominal values and from points between the bounds, until an error is below ``POOR``."""
     found = list(solved)
     for one in (fit.nominal, *_draws(fit)):
         if min(problem.explained([f.theta for f in found])) <= POOR:
@@ -62,7 +62,7 @@ def further_starts(fit: OutputFit, problem: Shooting, solved: Sequence[Fitted]) 
 
 
 def promising(fit: OutputFit, problem: Shooting, thetas: Sequence[Array]) -> list[Array]:
-    """The ``thetas`` with the least errors that differ from each other, ``FOLLOWED`` at most, the best first."""
+    """Select up to ``FOLLOWED`` distinct ``thetas`` with the least errors, the best first."""
     errors = problem.explained(thetas)
     order = sorted(range(len(thetas)), key=errors.__getitem__)
     kept: list[Array] = []
@@ -74,7 +74,7 @@ def promising(fit: OutputFit, problem: Shooting, thetas: Sequence[Array]) -> lis
 
 
 def _apart(fit: OutputFit, one: Array, other: Array) -> bool:
-    """Whether two starts differ by more than a few steps leave."""
+    """Whether two starts are distinct."""
     off = np.abs(one - other)
     share = off / np.maximum(np.maximum(np.abs(one), np.abs(other)), DISTINCT * fit.half)
     return bool(np.max(np.maximum(off / fit.half, share / FACTOR)) > DISTINCT)

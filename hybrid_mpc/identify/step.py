@@ -1,6 +1,6 @@
 """Models as steps ``(x, h, u, w) -> (x_next, h_next)`` over one period: the prior alone, and prior plus network.
 
-One code for training (any batch) and for export (one sample).
+The same code serves training (any batch) and export (one sample).
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from hybrid_mpc.identify.simulation import Simulation, required_substeps, steppe
 from hybrid_mpc.machine.prior import Prior
 
 SPAN = 10
-"""Periods over which the correction is averaged to find its scale."""
+"""Periods over which the correction is averaged for its scale."""
 VARIES = 1e-3
-"""Share of a signal's size below which its spread counts as none: what hardly varies is scaled by its size."""
+"""Ratio of spread to size of a signal below which the signal is scaled by its size."""
 
 
 def rk4(f: Callable[[Tensor], Tensor], x: Tensor, dt: float, substeps: int) -> Tensor:
@@ -57,9 +57,9 @@ class PriorEquations(nn.Module):
 
 
 class Step(nn.Module):
-    """What every model is: a step over one period, its derivative, and the prior that names its signals.
+    """Base class of all models: a step over one period, its derivative, and the prior that names its signals.
 
-    The prior's parameters ``p`` ``(n_p,)`` are those of ``prior`` where none are given.
+    The default of the prior's parameters ``p`` ``(n_p,)`` are those of ``prior``.
     """
 
     p: Tensor
@@ -82,11 +82,11 @@ class Step(nn.Module):
     def forward(
         self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Next state ``(..., n_x)`` and next hidden state ``(..., n_h)``, with ``u`` and ``w`` held over the period."""
+        """Next state ``(..., n_x)`` and hidden state ``(..., n_h)``; ``u`` and ``w`` are constant over the period."""
         raise NotImplementedError(f"{type(self).__name__} must define forward(x, h, u, w, p)")
 
     def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """States ``(T + 1, ..., n_x)`` of its own run from ``x`` and ``h`` under ``u``, ``w`` ``(T, ..., n)``."""
+        """States ``(T + 1, ..., n_x)`` of a free run from ``x`` and ``h`` with ``u``, ``w`` ``(T, ..., n)``."""
         states = [x]
         for u_k, w_k in zip(u, w, strict=True):
             x, h = self(x, h, u_k, w_k)
@@ -94,12 +94,12 @@ class Step(nn.Module):
         return torch.stack(states)
 
     def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
-        """Derivative of the state ``(..., n_x)`` at the instant."""
+        """Time derivative of the state ``(..., n_x)``."""
         raise NotImplementedError(f"{type(self).__name__} must define xdot(x, h, u, w, p)")
 
 
 class PriorStep(Step):
-    """The prior alone, by Runge-Kutta of order 4; its hidden state is empty.
+    """The prior alone, by the Runge-Kutta method of order 4; its hidden state is empty.
 
     Args:
         prior: The ODE prior.
@@ -118,42 +118,42 @@ class PriorStep(Step):
     def forward(
         self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Next state and the hidden state as it came."""
+        """Next state, and the unchanged hidden state."""
         return rk4(lambda z: self.xdot(z, h, u, w, p), x, self.dt, self.substeps), h
 
     def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """States of its own run, all runs in one call of CasADi; they are not differentiated."""
+        """States of free runs, all runs in one call of CasADi; not differentiable."""
         runs, periods = x.shape[:-1].numel(), len(u)
         u_all, w_all = (
             torch.cat([z, z[-1:]]).reshape(periods + 1, runs, z.shape[-1]).swapaxes(0, 1).numpy()
             for z in (u, w)
-        )  # the last period's goes on
+        )  # the last input is repeated
         simulation = Simulation(self.prior.equations.xdot, self.dt)
         states = simulation.values(x.reshape(runs, -1).numpy(), u_all, w_all, self.p.numpy(), self.substeps)
         return torch.tensor(states).swapaxes(0, 1).reshape(periods + 1, *x.shape)
 
     def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
-        """Derivative of the state at the instant."""
+        """Time derivative of the state."""
         rates: Tensor = self.equations.xdot(x, u, w, self.p if p is None else p)
         return rates
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """What makes features and outputs of order one; part of the model.
+    """Scales of features and outputs; part of the model.
 
     Args:
         x: Scale of each state ``(n_x,)``.
         u: Scale of each input ``(n_u,)``.
-        rate: Scale of what the prior gives as a feature: its rates of the corrected states ``(n_c,)``.
+        rate: Scale of the prior's rates of the corrected states, which are features ``(n_c,)``.
         correction: Scale of the network's output ``(n_c,)``.
-        w: Scale of each disturbance ``(n_w,)``. Default: there is none.
-        centre_x: What is taken off each state first. Default: zero.
-        centre_u: What is taken off each input first. Default: zero.
-        centre_w: What is taken off each disturbance first. Default: zero.
-        xdot: Size of each state's rate ``(n_x,)``: the unit in which errors of rates are added up. Default: 1.
-        substeps: Runge-Kutta sub-steps a period that the prior needs where the training data go. Default 0: as many as
-            it needs at rest.
+        w: Scale of each disturbance ``(n_w,)``. Default: no disturbances.
+        centre_x: Offset of each state, which is subtracted first. Default: zero.
+        centre_u: Offset of each input. Default: zero.
+        centre_w: Offset of each disturbance. Default: zero.
+        xdot: Scale of each state's rate ``(n_x,)`` in the errors of rates. Default: 1.
+        substeps: Runge-Kutta sub-steps a period that the prior needs along the training data. Default 0: as many as it
+            needs at rest.
     """
 
     x: tuple[float, ...]
@@ -175,18 +175,18 @@ class Scaling:
 
 
 class RecurrentStep(Step):
-    """A step with a network in it. A subclass is a form of model that :func:`~hybrid_mpc.identify.train.train` takes.
+    """A step with a network. A subclass is a form of model for :func:`~hybrid_mpc.identify.train.train`.
 
-    A subclass says what the network sees and gives (``sizes``, ``scaling_of``, ``features``) and what becomes of it
-    (``integrate``, ``derivative``, ``rate``, ``measured_rate``). ``use_prior=False`` makes the plain recurrent network
-    (RNN) of the paper's comparison. ``shift`` is what is added to the prior's parameters: those that were trained along
-    less the fitted ones; names, output and balances stay those of ``prior``.
+    A subclass defines the network's features and outputs (``sizes``, ``scaling_of``, ``features``) and their use
+    (``integrate``, ``derivative``, ``rate``, ``measured_rate``). ``use_prior=False`` gives the plain recurrent network
+    (RNN) of the paper's comparison. ``shift`` is added to the prior's parameters: trained minus fitted values. Names,
+    output and balances are those of ``prior``.
     """
 
     corrects_prior: ClassVar[bool]
-    """Whether a zero output is the prior itself: the training then starts there."""
+    """Whether the model with zero output is the prior; then the training starts with zero output."""
     needs_rates: ClassVar[bool] = False
-    """Whether it is trained on the recorded derivatives, which then have to be known."""
+    """Whether the training needs recorded derivatives."""
     scale_x: Tensor
     scale_u: Tensor
     scale_w: Tensor
@@ -222,28 +222,28 @@ class RecurrentStep(Step):
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
-        """Number of features and of outputs of its network."""
+        """Number of features and number of outputs of the network."""
         raise NotImplementedError(f"{cls.__name__} must define sizes(prior, use_prior)")
 
     @classmethod
     def scaling_of(cls, prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
-        """Scaling from training windows."""
+        """Compute the scaling from training windows."""
         raise NotImplementedError(f"{cls.__name__} must define scaling_of(prior, windows, dt, use_prior=...)")
 
     def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """Network inputs ``s``, scaled."""
+        """Scaled network inputs ``s``."""
         raise NotImplementedError(f"{type(self).__name__} must define features(x, u, w)")
 
     def integrate(
         self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
     ) -> Tensor:
-        """Next state with ``correction``, ``u`` and ``w`` held over the period."""
+        """Next state; ``correction``, ``u`` and ``w`` are constant over the period."""
         raise NotImplementedError(f"{type(self).__name__} must define integrate(x, u, w, correction, p)")
 
     def derivative(
         self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
     ) -> Tensor:
-        """Derivative of the state at the instant, ``(..., n_x)``."""
+        """Time derivative of the state, ``(..., n_x)``."""
         raise NotImplementedError(f"{type(self).__name__} must define derivative(x, u, w, correction, p)")
 
     def rate(self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor) -> Tensor:
@@ -266,43 +266,39 @@ class RecurrentStep(Step):
         return self.network.initial(1) if isinstance(self.network, StackedGRU) else super().h0
 
     def prior_rates(self, x: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
-        """The prior's rates ``(..., n_x)``, with the parameters that were trained along with the network."""
+        """The prior's rates ``(..., n_x)``, with the parameters that were trained with the network."""
         shift = self.own_shift if self.trained is None else self.trained.shift()
         rates: Tensor = self.equations.xdot(x, u, w, (self.p if p is None else p) + shift)
         return rates
 
     def stacked_features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """Features of a stack ``(T, 1 or networks, n, n_in)`` at ``x`` ``(T, n, n_x)``, ``u``, ``w``, the same for
-        all.
-        """
+        """Features ``(T, 1 or networks, n, n_in)`` of a stack at ``x`` ``(T, n, n_x)``, ``u``, ``w``."""
         return self.features(*(z.unsqueeze(1) for z in (x, u, w)))
 
     def correction(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-        """What the network gives (hybrid: rates ``(..., n_c)`` [units of the states per second]), and the next hidden
-        state.
-        """
+        """Output of the network (hybrid: rates ``(..., n_c)`` [state units per second]), and the next hidden state."""
         out, h_next = self.network(self.features(x, u, w), h)
         return out * self.scale_correction, h_next
 
     def forward(
         self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Next state ``(..., n_x)`` and next hidden state. What the network adds does not depend on ``p``."""
+        """Next state ``(..., n_x)`` and next hidden state. The network's correction does not depend on ``p``."""
         correction, h_next = self.correction(x, h, u, w)
         return self.integrate(x, u, w, correction, p), h_next
 
     def xdot(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor | None = None) -> Tensor:
-        """Derivative of the state at the instant, with the correction that ``(x, h, u, w)`` gives."""
+        """Time derivative of the state, with the correction at ``(x, h, u, w)``."""
         return self.derivative(x, u, w, self.correction(x, h, u, w)[0], p)
 
 
 class HybridStep(RecurrentStep):
-    """Prior plus recurrent correction of the rates that it names (``Prior.corrects``).
+    """Prior plus recurrent correction of the rates that the prior names (``Prior.corrects``).
 
-    ``h`` is updated once at ``(x_k, u_k, w_k)``; the correction is held over ``dt``; rates that are not corrected are
-    the prior's; Runge-Kutta of order 4 integrates. Rates are means over the period, so that an input that jumps at a
-    sample counts in the period it acts in. Without the prior (``use_prior=False``) the network gives the whole of the
-    rates that it corrects.
+    ``x_{k+1} = RK4(xdot_prior(x, u_k, w_k) + I_c c_k)`` with ``c_k, h_{k+1} = network(features(x_k, u_k, w_k), h_k)``:
+    ``h`` is updated once in each period, and the correction ``c_k`` is constant over ``dt``. Rates in objectives are
+    means over the period, so an input that jumps at a sample counts in the period in which it acts. Without the prior
+    (``use_prior=False``), the network gives the whole corrected rates.
 
     Args:
         prior: The ODE prior; it also names the states.
@@ -310,8 +306,7 @@ class HybridStep(RecurrentStep):
         scaling: Magnitudes of features and outputs.
         dt: Model period [s].
         use_prior: False for the plain recurrent network (RNN) of the paper's comparison.
-        shift: What is added to the prior's parameters ``(n_p,)``: those trained along less the fitted ones. Default:
-            nothing.
+        shift: Added to the prior's parameters ``(n_p,)``: trained minus fitted values. Default: zero.
 
     Raises:
         InputError: If the prior is too stiff for the period.
@@ -335,22 +330,22 @@ class HybridStep(RecurrentStep):
         rows = torch.tensor(prior.corrected, dtype=torch.int64)
         into = torch.zeros(len(prior.states), len(rows), dtype=torch.float64)
         into[rows, torch.arange(len(rows))] = 1.0
-        self.register_buffer("into", into, persistent=False)  # of corrections, into rates
+        self.register_buffer("into", into, persistent=False)  # matrix from corrections to rates
         self.register_buffer("own_rows", 1.0 - into.sum(1), persistent=False)
         at = rows.tolist()
         self.corrected = slice(at[0], at[-1] + 1) if at == list(range(at[0], at[-1] + 1)) else rows
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
-        """Number of features and of outputs of its network."""
+        """Number of features and number of outputs of the network."""
         return n_features(prior, use_prior), len(prior.corrected)
 
     @classmethod
     def scaling_of(cls, prior: Prior, windows: Windows, dt: float, *, use_prior: bool) -> Scaling:
-        """Means and spreads of the signals, root mean squares of the rates and of what the network must give.
+        """Compute means and spreads of the signals, and root mean squares of the rates and of the needed correction.
 
-        The latter is averaged over ``SPAN`` periods first: the noise of a differentiated measurement would set the
-        scale otherwise, and networks on so large a scale learn noise.
+        The needed correction is averaged over ``SPAN`` periods first. Otherwise the noise of a differentiated
+        measurement would determine the scale, and networks with such a large scale learn noise.
         """
         x, u, w = (z.flatten(0, 1) for z in (windows.x[:, :-1], windows.u, windows.w))
         rows = list(prior.corrected)
@@ -373,7 +368,7 @@ class HybridStep(RecurrentStep):
         )
 
     def features(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """Network inputs ``s = [x, u, w, prior's rates]``, scaled; an angle that turns as sin and cos."""
+        """Scaled network inputs ``s = [x, u, w, prior's rates]``; a periodic angle is replaced by its sin and cos."""
         parts, scaled = [], (x - self.scale_centre_x) / self.scale_x
         for i, signal in enumerate(self.prior.states):
             if signal.periodic:
@@ -386,14 +381,14 @@ class HybridStep(RecurrentStep):
             parts.append((w - self.scale_centre_w) / self.scale_w)
         if self.use_prior:
             parts.append(self.prior_rates(x, u, w)[..., self.corrected] / self.scale_rate)
-            if self.trained is not None:  # each network has features of its own
+            if self.trained is not None:  # each network has its own features
                 parts = [part.expand(*parts[-1].shape[:-1], -1) for part in parts]
         return torch.cat(parts, dim=-1)
 
     def integrate(
         self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
     ) -> Tensor:
-        """Next state with ``correction``, ``u`` and ``w`` held over the period."""
+        """Next state; ``correction``, ``u`` and ``w`` are constant over the period."""
         added = nn.functional.linear(correction, self.into)
 
         def rates(z: Tensor) -> Tensor:
@@ -403,9 +398,9 @@ class HybridStep(RecurrentStep):
         return rk4(rates, x, self.dt, self.substeps)
 
     def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
-        """States of its own run; on the CPU by :class:`~hybrid_mpc.identify.rollout.Rollout`.
+        """States of free runs; on the CPU by :class:`~hybrid_mpc.identify.rollout.Rollout`.
 
-        Those of one network are not differentiated.
+        Free runs of a single network are not differentiable.
         """
         if x.device.type != "cpu":
             return super().free_run(x, h, u, w)
@@ -422,7 +417,7 @@ class HybridStep(RecurrentStep):
 
     @cached_property
     def _rollout(self) -> Rollout:
-        """The model's features and period as scalar operations; ``p`` is what is added to the prior's parameters."""
+        """Features and period of the model as scalar operations; ``p`` is added to the prior's parameters."""
         prior, xdot = self.prior, self.prior.equations.xdot
         sizes = {name: xdot.size1_in(i) for i, name in enumerate("xuw")}
         x, u, w = (ca.SX.sym(name, size) for name, size in sizes.items())
@@ -451,7 +446,7 @@ class HybridStep(RecurrentStep):
     def derivative(
         self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
     ) -> Tensor:
-        """Derivative of the state at the instant: the prior's rates, and the correction on those it corrects."""
+        """Time derivative of the state: the prior's rates plus the correction."""
         own = self.prior_rates(x, u, w, p)
         return (own if self.use_prior else own * self.own_rows) + nn.functional.linear(correction, self.into)
 
@@ -460,7 +455,7 @@ class HybridStep(RecurrentStep):
         return (self.integrate(x.expand(*correction.shape[:-1], -1), u, w, correction) - x) / self.dt
 
     def measured_rate(self, x: Tensor, x_next: Tensor, xdot: Tensor) -> Tensor:
-        """Mean rate between two measured states; their derivative is not used."""
+        """Mean rate between two measured states; ``xdot`` is not used."""
         return (x_next - x) / self.dt
 
 
@@ -482,7 +477,7 @@ def mean(values: Tensor) -> tuple[float, ...]:
 
 
 def spread(values: Tensor) -> tuple[float, ...]:
-    """Standard deviation of each column; the size of one that hardly varies, and 1 for one that is zero."""
+    """Standard deviation of each column; the size of an almost constant column, and 1 for a zero column."""
     if not values.shape[1]:
         return ()
     deviations, sizes = values.std(0, correction=0).tolist(), values.square().mean(0).sqrt().tolist()
@@ -490,15 +485,15 @@ def spread(values: Tensor) -> tuple[float, ...]:
 
 
 PREFIX = "prior."
-"""What the names of trained parameters begin with among a training's weights."""
+"""Prefix of the names of trained parameters among a training's weights."""
 
 
 class TrainedParameters(nn.Module):
-    """A prior's free parameters as each of several networks has its own, trained along.
+    """A prior's free parameters, trained with the networks; each network has its own values.
 
-    What is trained is the way from the prior's value in units of the parameter's range, ``(networks, 1)``, zero at
-    first: weight decay then pulls towards the prior, as it pulls a network's weights towards no correction.
-    :meth:`project` keeps the values within their bounds.
+    The trained weight of a parameter is its distance from the prior's value, over the parameter's range, ``(networks,
+    1)``; it starts at zero. So weight decay pulls parameters towards the prior, as it pulls networks towards zero
+    correction. :meth:`project` keeps the values within their bounds.
     """
 
     spans: Tensor
@@ -521,7 +516,7 @@ class TrainedParameters(nn.Module):
         self.register_buffer("spans", into, persistent=False)
 
     def shift(self) -> Tensor:
-        """What is added to the prior's parameters, ``(networks, 1, n_p)``."""
+        """Difference from the prior's parameters, ``(networks, 1, n_p)``."""
         ways = torch.cat([self.ways[name] for name in self._spec], dim=1)
         return (ways @ self.spans).unsqueeze(1)
 
@@ -533,18 +528,18 @@ class TrainedParameters(nn.Module):
         }
 
     def project(self) -> None:
-        """Put values that have left their bounds back onto them."""
+        """Clip the values to their bounds."""
         with torch.no_grad():
             for name, (start, lower, upper) in self._spec.items():
                 span = upper - lower
                 self.ways[name].clamp_((lower - start) / span, (upper - start) / span)
 
     def weights(self) -> dict[str, nn.Parameter]:
-        """What is trained, by name."""
+        """Trained weights by name."""
         return {f"{PREFIX}{name}": way for name, way in self.ways.items()}
 
     def in_units(self, weights: Mapping[str, Tensor]) -> dict[str, NDArray[np.float64]]:
-        """Values ``(networks,)`` [their units] of weights named as those of :meth:`weights`, none beyond its bound."""
+        """Convert weights (named as in :meth:`weights`) to values ``(networks,)`` [their units], within the bounds."""
         out = {}
         for name, (start, lower, upper) in self._spec.items():
             way = weights[f"{PREFIX}{name}"][:, 0].cpu().numpy()
@@ -553,7 +548,7 @@ class TrainedParameters(nn.Module):
 
 
 def shift_to(prior: Prior, values: Mapping[str, float]) -> Tensor:
-    """What is added to a prior's parameters ``(n_p,)`` to have other ``values`` [their units] by name."""
+    """Difference ``(n_p,)`` of other ``values`` [their units] by name from a prior's parameters."""
     own = prior.values
     unknown = set(values) - set(own)
     if unknown:

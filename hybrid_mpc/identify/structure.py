@@ -1,4 +1,4 @@
-"""Find the wrong part of a prior: factors on its terms and signals are fitted to the recordings. No torch in here.
+"""Diagnosis of a wrong prior: factors on its terms and signals are fitted to the recordings. No torch in here.
 
 A parameter cannot correct a wrong sign, a wrong unit or a superfluous term. A factor on the term can: a factor of -1
 means a wrong sign, 57.3 means degrees in place of radians, 0 means that the term does not exist.
@@ -31,7 +31,7 @@ from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 
 Array = NDArray[np.float64]
 LARGEST = 1e7
-"""Largest factor: the largest mistake of a unit that is looked for is one of 1e6."""
+"""Largest factor, above the largest unit error of 1e6."""
 READINGS = (
     (-1.0, "its sign seems wrong"),
     (180 / math.pi, "radians seem to stand for degrees"),
@@ -47,49 +47,50 @@ READINGS = (
     *((10.0**k, f"a factor of 1e{k} is missing, as between units") for k in (1, 2, 3, 5, 6)),
     *((10.0**-k, f"it is 1e{k} times too large, as between units") for k in (1, 2, 3, 5, 6)),
 )
-"""Factors that say what the mistake is."""
+"""Factors that identify the mistake, and their texts."""
 UNITS = tuple(v for one in (10.0, 60.0, 1e3, 1e5) for v in (one, 1 / one))
-"""Factors from which trial fits start, beside 1 and -1: mistakes of a unit are too far from these. From each the values
-of ``READINGS`` within ``TAKEN`` are tried at the end.
+"""Start values of the factor besides 1 and -1, for unit errors. From each result, the values of ``READINGS`` within a
+factor of ``TAKEN`` are tried at the end.
 """
 TRIALS, FEW = 12, 4
-"""Windows of a trial fit, and of those by which mistakes of a unit, which are large, are compared."""
+"""Number of windows of a trial fit, and for the comparison of unit errors, which have large effects."""
 TAKEN = 30.0
-"""What parameters may take of a mistake at most."""
+"""Largest factor of a mistake that other parameters can compensate."""
 EACH = 2
-"""Mistakes of a unit that are tried of a term."""
+"""Number of unit errors that are tried for each term."""
 NEAR = 0.2
-"""Relative distance of a factor from such a value that counts as the same: parameters take a part of a mistake."""
+"""Relative distance from a value of ``READINGS`` up to which a factor counts as this value; other parameters compensate
+a part of a mistake."""
 SMALL = 0.1
 """Size of a factor below which its term may not exist."""
 SIZE = 1.5
-"""Least factor, or its inverse, that says that something is wrong: parameters take what is smaller."""
+"""Smallest factor (or inverse factor) that shows a mistake; parameters can compensate smaller factors."""
 SHORTER = 0.7
-"""Ratio of a length to a longer one from which on both tell the same."""
+"""Ratio of a shorter to a longer length above which only the longer one is used."""
 NAMED, GUESSED = 0.7, 0.5
-"""Error with the mistake mended over the error without below which the mistake is named: where the factor says what the
-mistake is, and where it says no more than that something is wrong.
+"""Ratio of the error with the corrected mistake to the error before, below which the mistake is reported: if the factor
+identifies the mistake, and if it does not.
 """
 BETTER = 0.95
-"""Ratio of two errors from which on the smaller counts."""
+"""Ratio of two errors below which the smaller one counts as smaller."""
 ALIKE, TOLD = 1.25, 2.0
-"""Ratio of two errors up to which their explanations count as equal; and up to which one whose factor says what the
-mistake is counts for more than one whose factor may be anything.
+"""Ratio of two errors up to which two explanations count as equal, and up to which an explanation whose factor
+identifies the mistake is preferred.
 """
 TRIED = 16
-"""Trial fits over long windows at most."""
+"""Maximum number of trial fits over long windows."""
 STEPS = 3
-"""Pairs of Gauss-Newton steps of a trial fit; it shows the size of an error, no more."""
+"""Pairs of Gauss-Newton steps of a trial fit, which only estimates the size of an error."""
 MOST = 3
-"""Explanations that are named at most where several are equal."""
+"""Maximum number of equal explanations that are reported."""
 ANGLES: Mapping[str, float] = {"rad": 0.5 * math.pi, "deg": 90.0}
 """A quarter of a turn in the units of angles."""
 
 
 VAGUE = ("its sign seems wrong, and its size too", "a factor or a unit seems to be wrong")
-"""What is said of other factors."""
+"""Texts for other factors: negative, and positive."""
 COMMON = 0.05, 15.0
-"""Factors between these that are positive may stand for missing physics, too: 0.5 and 2 say little of a mistake."""
+"""Range of positive factors that missing physics can also cause, so they do not identify a mistake."""
 SUMS = (ca.OP_ADD, ca.OP_SUB)
 
 
@@ -129,7 +130,9 @@ class Cause:
 
 
 def reading_of(factor: float, needed: bool = True) -> str:
-    """What a factor says of its term, and whether recordings do need the term; empty where it is about 1.
+    """Text about the mistake that a factor shows; empty for a factor near 1.
+
+    ``needed``: whether the recordings need the term.
 
     Example:
         >>> reading_of(-1.04), reading_of(0.001), reading_of(0.001, needed=False), reading_of(1.1)
@@ -145,13 +148,13 @@ def reading_of(factor: float, needed: bool = True) -> str:
 
 
 def _readings(factor: float) -> list[str]:
-    """What values near a factor say, the nearest first: 57.3 and 60 cannot be told apart."""
+    """Texts of the values near a factor, the nearest first; 57.3 and 60, for example, are not distinguishable."""
     off = sorted((abs(factor / value - 1.0), text) for value, text in READINGS)
     return [text for distance, text in off if distance <= NEAR]
 
 
 class _Editor:
-    """A prior's equations with factors on terms; terms are counted in the order in which they are met."""
+    """A prior's equations with factors on terms; terms are numbered in the order of their occurrence."""
 
     def __init__(self, prior: Prior, factors: Mapping[int, ca.SX]) -> None:
         self._prior, self._factors = copy.copy(prior), factors
@@ -161,7 +164,7 @@ class _Editor:
     terms: list[str]
 
     def expressions(self, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Rates and outputs at symbols; those of inputs and disturbances get a factor each."""
+        """Rates and outputs at symbols; each input and disturbance gets a factor."""
         signals = self._prior.inputs, self._prior.disturbances
         scaled = [
             ca.vertcat(*(v[i] * self._factor(f"{kind} {s.label}") for i, s in enumerate(own)))
@@ -169,7 +172,7 @@ class _Editor:
         ]
         rates, outputs, _ = self._prior.expressions(x, u, w, p)
         found = [ca.vertcat(*(ca.SX(v) for v in components(one))) for one in (rates, outputs)]
-        # put in at the end: the graph whose terms are counted is the prior's own
+        # substituted at the end, so that the numbered terms are those of the prior's own graph
         rates, outputs = ca.substitute(found, [u, w], scaled)
         return rates, outputs
 
@@ -207,7 +210,7 @@ class _Editor:
 
 
 class _Graph:
-    """The scalars of one method as a graph whose sums get factors on their operands."""
+    """Graph of the scalars of one method; the operands of its sums get factors."""
 
     def __init__(
         self,
@@ -222,7 +225,7 @@ class _Graph:
         self._roots: dict[str, Any] = {}
         self._uses: Counter[int] = Counter()
         met: set[int] = set()
-        for scalar in {one.element_hash(): one for one in scalars}.values():  # mirrored entries are one
+        for scalar in {one.element_hash(): one for one in scalars}.values():  # symmetric entries count once
             self._count(scalar, met)
 
     def _count(self, e: ca.SX, met: set[int]) -> None:
@@ -241,12 +244,12 @@ class _Graph:
         return self._moves[key]
 
     def edited(self, scalar: ca.SX, place: str) -> ca.SX:
-        """A scalar with factors, on the whole of it too."""
+        """Insert factors into a scalar, and one on the whole scalar."""
         text = self.text(scalar)
         if scalar.is_zero():
             return scalar
         key = f"{place}: {text}"
-        if key not in self._roots:  # entries of a symmetric matrix share theirs
+        if key not in self._roots:  # symmetric entries of a matrix share a factor
             whole = scalar.op() in SUMS
             self._roots[key] = self._factor(f"the {place}" if whole else f"{text} in the {place}")
         return self._inside(scalar, place) * self._roots[key]
@@ -275,11 +278,11 @@ class _Graph:
         return found
 
     def _chained(self, e: ca.SX) -> bool:
-        """Whether a node is a part of a longer sum: ``a + b`` in ``a + b + c``."""
+        """Whether a node is part of a longer sum: ``a + b`` in ``a + b + c``."""
         return e.op() in SUMS and e.n_dep() == 2 and self._uses[e.element_hash()] == 1
 
     def text(self, e: ca.SX) -> str:
-        """A node as a formula."""
+        """Write a node as a formula."""
         if not e.n_dep():
             return self._names.get(str(e), str(e))
         inner = [self.text(e.dep(i)) for i in range(e.n_dep())]
@@ -316,7 +319,7 @@ def _symbols(prior: Prior) -> list[ca.SX]:
 
 
 def terms_of(prior: Prior) -> list[str]:
-    """Terms and signals of a prior that get a factor, in the order of their numbers.
+    """Names of the terms and signals of a prior that get a factor, in the order of their numbers.
 
     Example:
         >>> from scenarios.pendulum.prior import PendulumPrior
@@ -329,9 +332,9 @@ def terms_of(prior: Prior) -> list[str]:
 
 
 def with_factor(make: Callable[..., Prior]) -> type[Prior]:
-    """The prior as a class of its own with a free factor, and for each of its terms a number that chooses it.
+    """Create a class of the prior with a free factor, and one selector (0 or 1) for each of its terms.
 
-    A term whose number is 1 has the factor, one whose number is 0 has none (:func:`terms_of` names them).
+    A term with selector 1 has the factor (:func:`terms_of` names the terms).
     """
     base = make()
     n, terms = len(base.parameters), len(terms_of(base))
@@ -357,7 +360,7 @@ class _Lenient(OutputFit):
     """Parameters of trial fits."""
 
     def substeps(self, theta: Array) -> int:
-        """As many as are needed, or the most that there may be: a model that is stiffer runs away and is not named."""
+        """Required sub-steps, or the maximum; a stiffer model diverges and is not reported."""
         return self._enough(self.values(theta))
 
     def _enough(self, values: Mapping[str, float]) -> int:
@@ -368,9 +371,9 @@ class _Lenient(OutputFit):
 
 
 class _FactorFit(_Lenient):
-    """Parameters and the factor of one term; several ``theta`` have the factor on a term each, by ``chosen``.
+    """Parameters and the factor of one term; with several ``theta``, ``chosen`` is the term of each.
 
-    A negative number chooses none.
+    A negative number stands for no term.
     """
 
     def __init__(self, make: Callable[..., Prior], dt: float) -> None:
@@ -381,34 +384,34 @@ class _FactorFit(_Lenient):
         self._needed: dict[tuple[bytes, int], int] = {}
 
     def visiting(self, known: Sequence[Trajectory]) -> _FactorFit:
-        """The same fit where these recordings with states go."""
+        """Copy the fit, with the points of these recordings."""
         other = copy.copy(self)
         other.points, other._needed = visited(known), {}
         return other
 
     def choosing(self, chosen: Sequence[int], held: bool = False) -> _FactorFit:
-        """The same fit for as many ``theta`` with these terms; slopes by a factor that is held are zero."""
+        """Copy the fit for several ``theta`` with these terms; derivatives by a fixed (``held``) factor are zero."""
         other = copy.copy(self)
         other.chosen, other.held = chosen, held
         return other
 
     @property
     def _free(self) -> list[int]:
-        """Places of what is fitted: the factor is the last of the free parameters."""
+        """Indices of the fitted parameters; the factor is the last one."""
         places = super()._free
         return places[:-1] if self.held else places
 
     def outputs(
         self, theta: Array, x: Array, windows: OutputWindows, substeps: int, slopes: Slopes
     ) -> tuple[Array, Array]:
-        """With a column for the factor, held or not."""
+        """Outputs and derivatives, with a column for the factor even if it is fixed."""
         y, by = super().outputs(theta, x, windows, substeps, slopes)
         if self.held and slopes == "all":
             by = np.insert(by, len(self.unit) - 1, 0.0, axis=-1)
         return y, by
 
     def most_substeps(self, thetas: Array) -> int:
-        """With each factor on its term."""
+        """Largest number of sub-steps, with each factor on its term."""
         return max(self._substeps_with(theta, k) for theta, k in zip(thetas, self.chosen, strict=True))
 
     def _substeps_with(self, theta: Array, term: int) -> int:
@@ -429,7 +432,7 @@ class _FactorFit(_Lenient):
 
 
 def _off_nominal(fit: OutputFit, theta: Array) -> float:
-    """How far parameters are off their nominal values over half their ranges: by ratios where none may be negative."""
+    """Squared distance of parameters from their nominal values, over half ranges; logarithmic for positive ranges."""
     ratio = (fit.lower > 0.0) & (fit.upper > fit.lower)
     low, high, own, nominal = (np.where(ratio, v, 1.0) for v in (fit.lower, fit.upper, theta, fit.nominal))
     relative = np.log(own / nominal) / np.where(ratio, 0.5 * np.log(high / low), 1.0)
@@ -438,10 +441,10 @@ def _off_nominal(fit: OutputFit, theta: Array) -> float:
 
 
 def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[float]:
-    """Lengths [s] of the free runs by which explanations are compared: less than the longest where small errors grow
-    faster, and the longest too, since a mistake may be what lets them grow.
+    """Lengths [s] of the free runs that compare explanations.
 
-    The shorter is twice the time in which they grow tenfold: first states are free.
+    If small errors grow fast, there is a shorter length: twice the time in which they grow tenfold (initial states are
+    free). The longest one is used too, because the mistake may cause the growth.
     """
     tenfold = math.log(GROWN[0]) / math.log(GROWN[-1])
     shorter = max(4 * fit.dt, 2 * tenfold * min(fit.reach(theta) for theta in thetas))
@@ -449,7 +452,7 @@ def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[fl
 
 
 def named(found: Sequence[Cause]) -> str:
-    """What is said of causes that explain equally much; empty without any."""
+    """Text of equally likely causes; empty without a cause."""
     return "; or, as likely, ".join(str(one) for one in found)
 
 
@@ -461,20 +464,21 @@ def causes(
     longest: float,
     time_unit: float,
 ) -> tuple[Cause, ...]:
-    """Mistakes in a prior that explain why it does not follow recordings; the likeliest first, equal ones behind it.
+    """Search mistakes in a prior that explain its errors on recordings; the likeliest first, then equally likely ones.
 
-    Each term of its equations and each signal gets a factor, which is fitted with all parameters: from 1, from -1, and
-    from the mistakes of a unit that explain short runs best. Where no factor explains the error, outputs are counted
-    the other way, signals of a kind are exchanged, and angles are turned by quarters of a turn.
-    A mistake is named where mending it takes the error of free runs to less than ``NAMED``, or ``GUESSED`` where its
-    factor does not say what is wrong (:func:`reading_of`).
+    Each term of the equations and each signal gets a factor in turn. The factor is fitted with all parameters, from 1,
+    from -1, and from the unit errors with the least error over short runs. If no factor explains the error, the signs
+    of outputs are changed, signals of a kind are exchanged, and angles are shifted by quarter turns.
+
+    A mistake is reported if its correction reduces the error of free runs below ``NAMED`` times the error before; below
+    ``GUESSED`` if the factor does not identify the mistake (:func:`reading_of`).
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         values: Fitted values [their units] by name.
         recorded: Training trajectories as recorded, with the inputs that act.
         dt: Model period [s].
-        longest: Length [s] of the free runs by which models are judged; shorter ones are taken where small errors grow.
+        longest: Length [s] of the free runs that evaluate models; shorter ones are used if small errors grow.
         time_unit: The machine's time unit [s].
     """
     known, sizes, noise = _smoothed(make, recorded, dt, time_unit)
@@ -483,7 +487,7 @@ def causes(
     lengths = _lengths(fit, thetas, longest)
 
     def quiet(windows: Shooting) -> float:
-        """Error up to which little is left but the sensors' noise."""
+        """Error below which the residual is mostly sensor noise."""
         return QUIET * float(np.sqrt(np.mean(np.square(noise / windows.spread))))
 
     found: list[Cause] = []
@@ -505,7 +509,7 @@ def causes(
                 make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit
             )
             found += [one for one in signals if one.ratio <= NAMED]
-        if length > lengths[0]:  # of a machine that does run away, another model may only run away later
+        if length > lengths[0]:  # on an unstable machine, a wrong model may only diverge later
             found = [one for one in found if before * one.ratio <= POOR]
         if found:
             break
@@ -523,16 +527,16 @@ def _moved(
     thetas: Sequence[Array],
     quiet: Callable[[Shooting], float],
 ) -> tuple[list[_Start], list[_Start]]:
-    """Starts without a factor, and with those that help over short windows, from where trial fits over these end.
+    """Starts without a factor, and with factors that reduce the error over short windows.
 
-    Long windows have more optima.
+    They are the results of trial fits over short windows, because long windows have more local optima.
 
     Args:
         fit: Parameters with the factor.
         short: Short windows.
-        few: A few of them.
-        thetas: Parameters to start from.
-        quiet: Error of windows up to which little is left but the sensors' noise.
+        few: Fewer short windows, for unit errors.
+        thetas: Start values of the parameters.
+        quiet: Returns the error of windows below which the residual is mostly sensor noise.
     """
     terms = range(len(fit.term_names))
     begun = [_Start(-1, theta) for theta in thetas]
@@ -553,7 +557,7 @@ def _moved(
 def _explained(
     fit: _FactorFit, problem: Shooting, short: Shooting, plain: Sequence[_Start], moved: Sequence[_Start]
 ) -> tuple[float, list[Cause]]:
-    """Error of free runs without a factor, and the terms whose factor explains it."""
+    """Error of free runs without a factor, and the causes: terms whose factor explains this error."""
     before = min(one.error for one in _tried(fit, problem, plain, STEPS, held=True))
     trials = _fitted(fit, problem, moved)
     least = min((one.error for one in trials.values()), default=math.inf)
@@ -568,20 +572,20 @@ def _explained(
 def causes_of_refusal(
     make: Callable[..., Prior], recorded: Sequence[Trajectory], dt: float, longest: float, time_unit: float
 ) -> tuple[Cause, ...]:
-    """Mistakes of a unit, or of a sign, with which a prior is refused: too stiff for the period, or not observable.
+    """Search unit and sign errors of a prior that is refused as too stiff for the period, or as not observable.
 
-    Each term that would make the prior fit for use gets such a factor, and its parameters are fitted to short runs. A
-    ratio is the error of free runs with the mistake mended over the outputs' spread.
+    If a factor on a term makes the prior usable, its parameters are fitted to short runs. ``ratio`` is then the error
+    of free runs with the correction, over the outputs' spread.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         recorded: Training trajectories as recorded.
         dt: Model period [s].
-        longest: Length [s] of the free runs by which models are judged.
+        longest: Length [s] of the free runs that evaluate models.
         time_unit: The machine's time unit [s].
     """
     known, points = None, None
-    if _fits(make, dt, time_unit):  # at rest; perhaps not where the recordings go
+    if _fits(make, dt, time_unit):  # usable at rest, but perhaps not along the recordings
         known = _smoothed(make, recorded, dt, time_unit)
         points = visited(known[0])
         if _fits(make, dt, time_unit, points):
@@ -598,7 +602,7 @@ def causes_of_refusal(
         return ()
     tried: list[Trial] = []
     for steps in (0, STEPS):
-        if tried:  # first states as the best of them smooths them
+        if tried:  # smooth the recordings with the best correction
             usable = [usable[one.start] for one in tried[:TRIED]]
             best = _with_mended(make, usable[0].term, float(usable[0].theta[-1]))
             known = _smoothed(best, recorded, dt, time_unit)
@@ -624,7 +628,7 @@ def _fits(make: Callable[..., Prior], dt: float, time_unit: float, points: Point
 
 
 def _with_mended(make: Callable[..., Prior], term: int, value: float) -> type[Prior]:
-    """The prior as a class of its own whose factor on one term is ``value``."""
+    """Create a class of the prior whose factor on one term is fixed at ``value``."""
     base = with_factor(make)
     fixed = {"factor": value, f"chosen {term}": 1.0}
     own = (
@@ -636,9 +640,7 @@ def _with_mended(make: Callable[..., Prior], term: int, value: float) -> type[Pr
 
 @dataclass(frozen=True)
 class _Start:
-    """A start of a trial fit: the term that has the factor (-1: none), ``theta`` with the factor behind it, and the
-    error over short windows.
-    """
+    """A start of a trial fit: term with the factor (-1: none), ``theta`` with the factor at its end, and error."""
 
     term: int
     theta: Array
@@ -648,17 +650,19 @@ class _Start:
 def _tried(
     fit: _FactorFit, problem: Shooting, begun: Sequence[_Start], steps: int, held: bool = False
 ) -> list[Trial]:
-    """Trial fits from starts, by their numbers.
+    """Run trial fits from several starts.
 
     Args:
-        fit: Parameters with the factor, which is held where ``held`` says so.
+        fit: Parameters with the factor.
         problem: Windows.
         begun: Starts.
-        steps: Pairs of Gauss-Newton steps; without any, first states alone are fitted.
-        held: Whether factors stay as they are.
+        steps: Pairs of Gauss-Newton steps; 0: only initial states are fitted.
+        held: True: factors are fixed. Default: False.
     """
     groups: dict[int, list[int]] = {}
-    for i, one in enumerate(begun):  # a stiff one does not slow the others down
+    for i, one in enumerate(
+        begun
+    ):  # grouped by sub-steps, so that a stiff start does not slow down the others
         substeps = fit.choosing([one.term]).most_substeps(one.theta[None])
         groups.setdefault(substeps.bit_length(), []).append(i)
     found = []
@@ -674,7 +678,7 @@ def _tried(
 
 
 def _units(fit: _FactorFit, few: Shooting) -> list[_Start]:
-    """Mistakes of a unit that explain a few short windows best at the nominal values, ``EACH`` of a term at most."""
+    """Unit errors with the least error over a few short windows at nominal values, at most ``EACH`` for each term."""
     (before,) = _tried(fit, few, [_Start(-1, fit.nominal)], 0)
     terms = len(fit.term_names)
     begun = [_Start(k, np.append(fit.nominal[:-1], unit)) for k in range(terms) for unit in UNITS]
@@ -684,7 +688,7 @@ def _units(fit: _FactorFit, few: Shooting) -> list[_Start]:
 
 
 def _best(begun: Sequence[_Start], trials: Sequence[Trial], each: int) -> list[_Start]:
-    """Starts from where trial fits ended, ``each`` of a term at most; the best come first."""
+    """Starts at the results of trial fits, at most ``each`` for each term, the best first."""
     count: Counter[int] = Counter()
     found = []
     for one in sorted(trials, key=lambda trial: trial.error):
@@ -698,8 +702,10 @@ def _best(begun: Sequence[_Start], trials: Sequence[Trial], each: int) -> list[_
 def _cause(
     fit: _FactorFit, problem: Shooting, short: Shooting, term: int, free: Trial, before: float
 ) -> Cause:
-    """What a term's factor says: a value that says what the mistake is where that explains as much as any other, those
-    with parameters nearest to their nominal values where several do.
+    """Cause that a term's factor shows.
+
+    A value of ``READINGS`` is preferred if its error is as small as any other; of several, the one whose parameters are
+    nearest to their nominal values.
     """
     name = fit.term_names[term]
     why = reading_of(float(free.theta[-1]), _needed(fit, problem, term, free))
@@ -732,20 +738,20 @@ def _needed(fit: _FactorFit, problem: Shooting, term: int, trial: Trial) -> bool
 
 
 def _fitted(fit: _FactorFit, problem: Shooting, begun: Sequence[_Start]) -> dict[int, Trial]:
-    """For each term the best of the fits with a free factor that went on to the end."""
+    """The best complete fit with a free factor, by term."""
     found: dict[int, Trial] = {}
     for one in sorted(_tried(fit, problem, begun, 2 * STEPS), key=lambda trial: trial.error):
         other = found.setdefault(begun[one.start].term, one)
         turned = one.theta[-1] < 0.0 and abs(one.theta[-1] + 1.0) < abs(other.theta[-1] + 1.0)
         if turned and other.theta[-1] < 0.0 and other.error > BETTER * one.error:
-            found[begun[one.start].term] = one  # where its size is unknown, its sign alone counts
+            found[begun[one.start].term] = one  # of two negative factors, prefer the one nearer to -1
     return found
 
 
 def _smoothed(
     make: Callable[..., Prior], recorded: Sequence[Trajectory], dt: float, time_unit: float
 ) -> tuple[list[Trajectory], Array, Array]:
-    """Recordings with states that the nominal prior smooths, sizes of the states, and noise of the outputs."""
+    """Recordings with states smoothed by the nominal prior, sizes of the states, and noise of the outputs."""
     smoother = rough_smoother(make(), recorded, dt, time_unit=time_unit)
     sizes = smoother.sizes
     return with_states(recorded, smoother, 0.0), np.array(sizes.x), np.array(sizes.noise)
@@ -755,14 +761,14 @@ def _signals(
     make: Callable[..., Prior], recorded: Sequence[Trajectory], before: float, starts: Sequence[Array], dt: float,
     length: float, time_unit: float,
 ) -> Iterator[Cause]:  # fmt: skip
-    """Signals that are counted the other way, exchanged, or angles from another zero."""
+    """Causes in the signals: wrong sign, exchanged signals, angles with another zero."""
     prior = make()
     changes: list[tuple[str, str, Callable[[Trajectory], Trajectory]]] = []
     for key, signals in (("y", prior.outputs), ("u", prior.inputs)):
         kind = "output" if key == "y" else "input"
         for j, signal in enumerate(signals):
             name = f"{kind} {signal.label}"
-            if key == "y" and signal.lower < 0.0 < signal.upper:  # of an input the factor says so
+            if key == "y" and signal.lower < 0.0 < signal.upper:  # for an input, the factor covers this case
                 changes.append((name, "it seems to be counted the other way", _changed(key, j, j, -1.0)))
             for turns in (2.0, 1.0, -1.0) if signal.unit in ANGLES and key == "y" else ():
                 off = turns * ANGLES[signal.unit]

@@ -1,6 +1,6 @@
-"""The library of physical terms that a prior may lack, with bounds and scales from its recordings. No torch in here.
+"""Library of physical terms that a prior may lack, with bounds and scales from the recordings. No torch in here.
 
-Which terms can apply follows from a prior's structure and units, never from names.
+The structure and units of a prior, not its names, determine which terms apply.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from hybrid_mpc.machine.units import parse_unit
 
 Array = NDArray[np.float64]
 WIDEST, NARROWEST = 0.05, 0.005
-"""Speeds over which dry friction turns round, over the speed's size. Between them it is half of what the speed changes
-in a period: the recordings show nothing finer, and it needs no shorter integration steps."""
+"""Largest and smallest width of the sign change of dry friction, over the speed's size. Between them, the width is half
+the change of the speed in a period: the recordings do not resolve less, and the integration needs no shorter steps."""
 EXPONENTS = 0.25, 4.0
-"""Bounds of the exponent of a loss: below that of an outlet, 0.5, to that of radiation."""
+"""Bounds of the exponent of a loss; an outlet has 0.5, radiation 4."""
 REACH = 3.0
-"""Bound of a term's weight: what it does at most, over what the state's rate is in the recordings."""
+"""Bound of a term's weight: largest effect of the term, over the state's rate in the recordings."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A term in one or several forms (of an exponent, an edge), of which the best is taken.
+    """A term in one or several forms (for example with different exponents); the best form is used.
 
     Args:
         name: Name of the candidate.
-        forms: Its forms; names of their parameters are distinct.
+        forms: The forms, with distinct names of parameters.
     """
 
     name: str
@@ -44,28 +44,28 @@ class Candidate:
 
 
 def library(prior: Prior, points: Points, dt: float, length: float) -> tuple[Candidate, ...]:
-    """Terms that a prior may lack, with bounds and scales from where its machine was.
+    """Terms that a prior may lack, with bounds and scales from the recordings.
 
-    Which can apply follows from its structure and units:
+    Structure and units of the prior determine which terms apply:
 
-    - a state whose rate is another state is an axis' position, and most friction acts on axes alone;
+    - a state whose rate is another state is the position of an axis; most kinds of friction act on axes only;
     - dry friction and losses act on other states of both signs, such as the speed of a fan;
-    - terms that touch forces need a :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior`;
-    - radiation and free convection are of temperatures;
-    - an overflow is of a level: a state that cannot be negative, and no temperature;
-    - an angle that turns has no loss, and acts on no other state by its size.
+    - forces and potentials need a :class:`~hybrid_mpc.machine.mechanical.MechanicalPrior`;
+    - radiation and free convection act on temperatures;
+    - an overflow acts on a level: a state that is never negative and not a temperature;
+    - a periodic angle has no loss, and its value does not act on other states.
 
     Args:
         prior: The prior with fitted values.
         points: States ``(n, n_x)``, inputs ``(n, n_u)`` and disturbances ``(n, n_w)`` of the recordings.
         dt: Model period [s].
-        length: Length [s] of the free runs that models are judged by: no lag is longer than a quarter.
+        length: Length [s] of the free runs that evaluate models; the largest lag is a quarter of it.
     """
     return tuple(_Library(prior, points, dt, length).candidates())
 
 
 class _Library:
-    """Scales of the signals, and the terms that are made with them."""
+    """Scales of the signals, and the terms with these scales."""
 
     def __init__(self, prior: Prior, points: Points, dt: float, length: float) -> None:
         self.prior, self.dt, self.length = prior, dt, length
@@ -85,7 +85,7 @@ class _Library:
             self.rates = np.concatenate([self.rates[:half], np.sqrt(np.mean(np.square(forces), axis=0))])
 
     def candidates(self) -> Iterator[Candidate]:
-        """All of them."""
+        """All candidates."""
         exact = set(self.positions.values())
         for i, state in enumerate(self.prior.states):
             if i in self.positions:
@@ -102,7 +102,7 @@ class _Library:
     def _weight(
         self, name: str, i: int, size: float, unit: str, *, positive: bool = False, words: str = ""
     ) -> Parameter:
-        """A weight of what has this size on the rate of state ``i``."""
+        """Weight of a law of this size in the rate of state ``i``."""
         most = REACH * self.rates[i] / max(size, 1e-12)
         return Parameter(name, 0.0, unit, 0.0 if positive else -most, most, words)
 
@@ -203,7 +203,9 @@ class _Library:
             return self._weight(f"{key}_{own}", i, size, over(unit, *per), words=words)
 
         yield _one(laws.offset(own, weight("r_0", 1.0, words="offset of the rate"), place="rate"))
-        if state.lower < 0 and not (state.periodic or temperature):  # a speed without a position, a current
+        if state.lower < 0 and not (
+            state.periodic or temperature
+        ):  # such as a speed without a position, or a current
             size = float(np.sqrt(np.mean(values**2)))
             dry = self._weight(f"F_c_{own}", i, 1.0, unit, positive=True, words="dry friction")
             yield _one(laws.coulomb(own, dry, width=0.05 * size or 1.0, place="rate"))
@@ -232,7 +234,7 @@ class _Library:
                     yield _one(laws.product(own, k, one=one.name, two=two.name, centres=centres))
 
     def _losses(self, i: int, state: Signal, temperature: bool) -> Iterator[Candidate]:
-        """What a state loses: to its surroundings, by radiation, over an edge."""
+        """Losses of a state: to its surroundings, by radiation, by overflow."""
         own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
         low, high = float(values.min()), float(values.max())
 
@@ -252,7 +254,7 @@ class _Library:
                 if temperature and exponent == 0.5:
                     continue
                 k = weight(f"k_{number}{key}", far, "1/s", "loss")
-                # free convection lies between; an outlet below
+                # the exponent is free: 1 to 1.33 for free convection, 0.5 for an outlet
                 n = Parameter(f"n_{number}{key}_{own}", exponent, "-", *EXPONENTS, "exponent of the loss")
                 forms.append(laws.loss(own, k, n, scale=far, reference=reference))
         yield Candidate(f"loss of {own}", tuple(forms))
@@ -331,7 +333,7 @@ class _Library:
             yield from zip(group, values.T, strict=True)
 
     def _alike(self, i: int, unit: str) -> Iterator[tuple[Signal, Array]]:
-        """States and disturbances of the same unit."""
+        """Other states and disturbances of the same unit."""
         for k, (s, c) in enumerate(self._signals()):
             if s.unit == unit and k != i and s.name not in {one.name for one in self.prior.inputs}:
                 yield s, c
@@ -404,7 +406,7 @@ def _short(name: str) -> str:
 
 
 def over(unit: str, *by: str) -> str:
-    """A unit over others.
+    """Divide a unit by others.
 
     Example:
         >>> over("N m", "rad/s"), over("m/s", "m/s"), over("1", "V", "V"), over("m/s", "m", "m")
@@ -425,7 +427,7 @@ def over(unit: str, *by: str) -> str:
 
 
 def _base(unit: str) -> str:
-    """The unit of a position, of that of its speed."""
+    """Unit of a position from the unit of its speed."""
     return unit.removesuffix("/s")
 
 

@@ -41,9 +41,9 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
     },
     "Sensors": dict.fromkeys(("output_gain", "output_offset", "output_curve", "output_lag"), "outputs that change"),
 }  # fmt: skip
-"""Laws by kind, and what each is tried for (:func:`~hybrid_mpc.identify.term_library.library`)."""
+"""Laws by kind, with the signals that each law applies to (:func:`~hybrid_mpc.identify.term_library.library`)."""
 UNITS = 3
-"""Units of a parameter that a cell shows at most."""
+"""Maximum number of units of a parameter in a cell."""
 HEAD = """# Terms
 
 The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search. `hm.terms.LAW(...)` makes

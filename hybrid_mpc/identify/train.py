@@ -1,6 +1,6 @@
 """Training of recurrent corrections: teacher forcing, then free runs; checkpointed and resumable.
 
-:func:`train` drives a :class:`TrainingRun` to its end and gives a :class:`Trained`. Checkpoints are at the end.
+:func:`train` completes a :class:`TrainingRun` and returns a :class:`Trained`.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from hybrid_mpc.machine.prior import Prior
 
 Progress = Callable[[int, int, float], None]
 FIXED = 64
-"""Windows, the same all along, on which the bounds are lowered."""
+"""Number of fixed windows on which the bounds are lowered."""
 REPEATS = 5
-"""Updates skipped in a row after which a network is stopped; a single batch may well diverge once."""
+"""Number of successive skipped updates after which a network is stopped; a single batch may diverge by chance."""
 CLIP = 1.0
 """Largest norm of a network's gradient."""
 
@@ -65,32 +65,33 @@ def train(
     device: str = "cpu",
     on_progress: Progress = lambda done, total, error: None,
 ) -> Trained:
-    """Train a stack of networks on trajectories; each network keeps the weights best on validation free runs.
+    """Train a stack of networks on trajectories; each network keeps the weights with the least validation error.
 
-    First teacher forcing (the paper's training), then free runs with back-propagation through the integrator. Where the
-    first objective is that of the outputs, teacher forcing takes that of the rates: a period hardly moves an output.
-    All kinds get the same steps, batches and data. A network whose gradient is not finite skips that update; after
-    several in a row it stops with its best weights, and ``Trained.failures`` says why.
+    First teacher forcing (the paper's training), then free runs with back-propagation through the integrator. If the
+    first objective is that of the outputs, teacher forcing uses that of the rates instead, because outputs hardly
+    change within a period. All kinds get the same steps, batches and data. A network whose gradient is not finite skips
+    the update. After several such updates in a row, the network stops with its best weights, and ``Trained.failures``
+    names the reason.
 
     Args:
         prior: The fitted prior.
         training: Training trajectories.
-        validation: Validation trajectories; they choose weights, they are not trained on.
+        validation: Validation trajectories, which only select weights.
         settings: See :class:`~hybrid_mpc.identify.settings.TrainingSettings`.
-        form: The form of the model. Default: prior plus correction of its acceleration.
+        form: The form of the model. Default: prior plus correction of its rates.
         checkpoint: File to save to and to resume from. Default: none.
-        device: Where the tensors live, ``"cpu"`` or e.g. ``"cuda"``; the result is on the CPU in any case.
+        device: Device of the tensors, ``"cpu"`` or e.g. ``"cuda"``; the result is always on the CPU.
         on_progress: ``(done, total, best validation error)`` at every evaluation.
 
     Raises:
-        InputError: If no trajectory is long enough, a value is not finite, prior replay is asked of a form that
-            corrects no prior, or the checkpoint is another training's.
+        InputError: If no trajectory is long enough, a value is not finite, prior replay is requested for a form that
+            does not correct a prior, or the checkpoint belongs to another training.
 
     Example:
         >>> trained = train(prior, runs[:3], runs[3:], settings)  # doctest: +SKIP
         >>> step = trained.step(prior, dt=0.02)  # doctest: +SKIP
     """
-    torch.set_num_threads(1)  # tensors this small only lose by threads
+    torch.set_num_threads(1)  # threads slow down operations on such small tensors
     run = TrainingRun(prior, training, validation, settings, device, form)
     key = _key(settings, training, validation, prior, form)
     total = settings.teacher_steps + settings.free_run_steps
@@ -110,13 +111,13 @@ def train(
 
 @dataclass(frozen=True)
 class TrainingFailure:
-    """Updates of a network that were skipped because a number was not finite.
+    """Skipped updates of a network because of numbers that are not finite.
 
     Args:
         network: Number of the network.
-        objective: The objective whose loss was not finite; ``"gradient"`` if all losses were finite.
-        step: The last skipped update.
-        stopped: Whether the network keeps its best weights from there on.
+        objective: Objective whose loss was not finite; ``"gradient"`` if all losses were finite.
+        step: Step of the last skipped update.
+        stopped: Whether the network was stopped; it then keeps its best weights.
     """
 
     network: int
@@ -126,23 +127,23 @@ class TrainingFailure:
 
 
 HEAD = ("w_out", "b_out")
-"""Weights that a network's output is proportional to."""
+"""Weights to which a network's output is proportional."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """Result of a training: plain arrays, so that it travels between processes and into files.
+    """Result of a training, as plain arrays for files and other processes.
 
     Args:
-        settings: What it was trained with.
-        scaling: Magnitudes inside the model.
-        weights: Best weights of each network by its validation, stacked; parameters of the prior that were trained
-            along are among them as ``prior.<name>`` ``(networks,)`` [SI].
-        validation: Best validation error of each network ``(networks,)``.
-        curve: ``step, free_run``, ``loss_`` and ``bound_`` with each objective's name, ``validation``; one row
-            an evaluation, a column a network.
-        skipped: Updates skipped because a number was not finite, per network.
-        failures: The objectives they were skipped for, one entry a network that has any.
+        settings: Settings of the training.
+        scaling: Scales of features and outputs.
+        weights: Weights of each network with its least validation error, stacked. Trained parameters of the prior are
+            ``prior.<name>`` ``(networks,)`` [SI].
+        validation: Least validation error of each network ``(networks,)``.
+        curve: ``step, free_run``, ``loss_NAME`` and ``bound_NAME`` of each objective, ``validation``; one row for each
+            evaluation, one column for each network.
+        skipped: Number of skipped updates of each network ``(networks,)``.
+        failures: One entry for each network with skipped updates.
         form: The form of the model.
     """
 
@@ -157,20 +158,20 @@ class Trained:
 
     @property
     def best(self) -> int:
-        """The network with the lowest validation error."""
+        """Number of the network with the least validation error."""
         return int(self.ranking[0])
 
     @property
     def ranking(self) -> NDArray[np.intp]:
-        """The networks, the best first."""
+        """Numbers of the networks, the best first."""
         return np.argsort(self.validation, kind="stable")
 
     @property
     def shares(self) -> NDArray[np.float64]:
-        """Share of each network in the mean ``(networks,)``: by one over the square of its validation error.
+        """Weight of each network in the mean ``(networks,)``, proportional to 1 / (validation error)^2.
 
-        So are guesses weighed whose errors have nothing to do with each other. A network without finite validation has
-        none, unless none has one; then all have the same.
+        These weights are optimal for independent errors. A network without a finite validation error has the weight 0.
+        If no network has a finite validation error, all weights are equal.
         """
         finite = np.isfinite(self.validation)
         if not finite.any():
@@ -180,11 +181,12 @@ class Trained:
         return np.asarray(weight / weight.sum())
 
     def step(self, prior: Prior, dt: float, i: int | None = None) -> RecurrentStep:
-        """The model: the mean of the networks' corrections (:attr:`shares`) as one network; or network ``i`` alone.
+        """Create the model: the weighted mean of the networks' corrections (:attr:`shares`) as one network.
 
-        Each network has left out another part of the data, so each errs elsewhere, and the mean errs less than the one
-        that validation ranks first. It is around the prior's parameters that were trained along, or their mean.
-        ``prior`` is the fitted one: its balances and output are the step's.
+        With ``i``, the model is network ``i`` alone. The networks leave out different parts of the data, so their
+        errors differ, and the mean has less error than the network with the least validation error. The prior's
+        parameters are those of ``prior`` (the fitted one), or the trained ones (their mean). Balances and output are
+        those of ``prior``.
         """
         values = self.prior_values(i)
         shift = shift_to(prior, values) if values else None
@@ -194,18 +196,18 @@ class Trained:
         return self._step(prior, dt, own, lambda stack: stack.joined(shares), shift)
 
     def steps(self, prior: Prior, dt: float) -> list[RecurrentStep]:
-        """The steps of all networks, each alone, in their ranking."""
+        """Steps of the single networks, the best first."""
         return [self.step(prior, dt, i) for i in self.ranking.tolist()]
 
     def stacked_step(self, prior: Prior, dt: float) -> RecurrentStep:
-        """The step of all networks at once, tensors ``(networks, n, ...)``; the prior's parameters must be fixed."""
+        """Step of all networks at once, with tensors ``(networks, n, ...)``; the prior's parameters must be fixed."""
         own = {name: torch.tensor(w) for name, w in self.weights.items()}
         return self._step(prior, dt, own, lambda stack: stack, None)
 
     def shrunk(self, prior: Prior, share: float) -> Trained:
-        """The same networks, whose corrections count by ``share`` only: 0 is the fitted ``prior``, 1 what was trained.
+        """Multiply the networks' corrections by ``share``: 0 gives the fitted ``prior``, 1 the trained model.
 
-        Parameters of the prior that were trained along go the same share of their way.
+        The difference of trained parameters from those of the prior is multiplied too.
         """
         own = prior.values
 
@@ -218,7 +220,7 @@ class Trained:
         return self if share == 1 else replace(self, weights={n: part(n, w) for n, w in self.weights.items()})
 
     def prior_values(self, i: int | None = None) -> dict[str, float]:
-        """Values [SI] of the parameters trained along with network ``i``, or their mean; empty if none were."""
+        """Values [SI] of the trained parameters of network ``i``, or their mean; empty without trained parameters."""
         shares = self.shares if i is None else np.eye(len(self.validation))[i]
         own = {n: shares @ w for n, w in self.weights.items() if n.startswith(PREFIX)}
         return {n.removeprefix(PREFIX): float(value) for n, value in own.items()}
@@ -239,9 +241,9 @@ class Trained:
 
 
 class TrainingRun:
-    """State of one training. Batches are drawn from (seed, step), so a resumed run is the same run.
+    """State of a training; arguments as in :func:`train`.
 
-    Arguments as in :func:`train`.
+    A batch depends only on seed and step, so a resumed training has the same result.
     """
 
     def __init__(
@@ -301,18 +303,18 @@ class TrainingRun:
 
     @property
     def stage_end(self) -> int:
-        """Steps done when the present stage is over."""
+        """Number of steps at the end of the present stage."""
         s = self.settings
         return s.teacher_steps + s.free_run_steps if self.free else s.teacher_steps
 
     @property
     def over(self) -> bool:
-        """All steps are done, or no network is left."""
+        """Whether all steps are done, or all networks are stopped."""
         s = self.settings
         return self.done >= s.teacher_steps + s.free_run_steps or bool(self.stopped.all())
 
     def enter_stage(self) -> None:
-        """Fresh optimiser and bounds; the free-run stage starts from the best weights so far."""
+        """Start a stage with a new optimizer and new bounds; the free-run stage starts from the best weights."""
         self.free = self.done >= self.settings.teacher_steps
         if self.done:
             self._load(self.best_weights)
@@ -324,7 +326,7 @@ class TrainingRun:
         self.evaluate()
 
     def update(self) -> None:
-        """One step of AdamW on a batch, each network's gradient clipped for itself."""
+        """One AdamW step on a batch; gradients are clipped separately for each network."""
         s = self.settings
         rng = np.random.default_rng([s.seed, self.done])
         batch = self.windows.take(torch.tensor(rng.integers(len(self.windows), size=s.batch)))
@@ -345,7 +347,7 @@ class TrainingRun:
         self.done += 1
 
     def evaluate(self) -> None:
-        """Lower the bounds on the fixed windows, and take the weights that are best on validation free runs."""
+        """Lower the bounds on the fixed windows, and keep the weights with the least validation error."""
         with torch.no_grad():
             losses = self._losses(self.fixed)
             self.index = self.index.lower(losses)
@@ -360,7 +362,7 @@ class TrainingRun:
         self.rows.append(torch.cat([torch.stack(head), losses.T, self.index.bounds.T, valid[None]]))
 
     def snapshot(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """All tensors and numbers that the rest of the run depends on."""
+        """All tensors and numbers that the rest of the training depends on."""
         tensors = {f"w.{n}": w.detach() for n, w in self.weights.items()}
         tensors |= {f"best.{n}": w for n, w in self.best_weights.items()}
         for i, state in self.optimizer.state_dict()["state"].items():
@@ -389,7 +391,7 @@ class TrainingRun:
         self.done, self.free = int(numbers["done"]), bool(numbers["free"])
 
     def result(self) -> Trained:
-        """The best weights and the curve."""
+        """Return the best weights and the curve."""
         rows, objectives = torch.stack(self.rows).cpu().numpy(), list(self.objectives)
         losses, bounds = ([f"{kind}_{n}" for n in objectives] for kind in ("loss", "bound"))
         names = ("step", "free_run", *losses, *bounds, "validation")
@@ -405,15 +407,15 @@ class TrainingRun:
         return torch.optim.AdamW(list(self.weights.values()), weight_decay=self.decay)
 
     def _losses(self, windows: Windows, first: int | None = None) -> Tensor:
-        """Losses ``(networks, objectives)`` of the present stage's prediction, of the first objectives or of all."""
+        """Losses ``(networks, objectives)`` of the present stage, of the first objectives or of all."""
         prediction = (free_run if self.free else teacher_forced)(self.step, windows)
         every = list(self.objectives.values())[:first]
         if not self.free and next(iter(self.objectives)) == "output":
-            every[0] = error_objective  # a single period shows in the rates, hardly in the outputs
+            every[0] = error_objective  # within one period, the outputs hardly change
         return torch.stack([objective(self.step, prediction) for objective in every], dim=-1)
 
     def _clip(self) -> Tensor:
-        """Clip each network's gradient; one that is not finite becomes zero. Which ones were finite."""
+        """Clip each network's gradient, and set those that are not finite to zero; returns the mask of finite ones."""
         grads = [w.grad for w in self.weights.values() if w.grad is not None]
         norm = torch.stack([g.flatten(1).square().sum(1) for g in grads]).sum(0).sqrt()
         finite = torch.isfinite(norm)
@@ -423,7 +425,7 @@ class TrainingRun:
         return finite
 
     def _note(self, losses: Tensor, finite: Tensor) -> None:
-        """Count and name skipped updates; a network that has too many in a row goes back to its best weights."""
+        """Record skipped updates; a network with too many in a row returns to its best weights and stops."""
         skips = ~finite & ~self.stopped
         self.skipped = self.skipped + skips
         self.in_row = torch.where(skips, self.in_row + 1, 0)
@@ -451,14 +453,16 @@ class TrainingRun:
 
 
 def _stack(prior: Prior, s: TrainingSettings, form: type[RecurrentStep]) -> StackedGRU:
-    """The untrained stack of a training."""
+    """Create the untrained stack of a training."""
     n_in, n_out = form.sizes(prior, s.use_prior)
-    zero_head = s.use_prior and form.corrects_prior  # a model that corrects the prior starts as the prior
+    zero_head = (
+        s.use_prior and form.corrects_prior
+    )  # a model that corrects the prior starts with zero correction
     return StackedGRU(s.networks, n_in, s.hidden, n_out, seed=s.seed, zero_head=zero_head)
 
 
 def _by(values: Tensor, weight: Tensor) -> Tensor:
-    """A value per network, shaped to go with a stacked weight."""
+    """Reshape one value for each network for broadcasting with a stacked weight."""
     return values.view(-1, *([1] * (weight.dim() - 1)))
 
 
@@ -469,7 +473,7 @@ def _key(
     prior: Prior,
     form: type[RecurrentStep],
 ) -> str:
-    """Hash of everything that decides a training."""
+    """Hash of all arguments that the result of a training depends on."""
     plain = [asdict(s), prior.values, form.__name__]
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for trajectory in (*training, *validation):
@@ -479,7 +483,7 @@ def _key(
 
 
 def save_checkpoint(path: Path, key: str, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
-    """Write a checkpoint, one safetensors file; a kill at any moment leaves the old file or the new one."""
+    """Write a checkpoint as one safetensors file; after an interruption, the old or the new file exists."""
     own = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
     text = json.dumps(numbers)
     metadata = {"key": key, "numbers": text, "sha256": _content_hash(own, text)}
@@ -488,8 +492,8 @@ def save_checkpoint(path: Path, key: str, tensors: dict[str, Tensor], numbers: d
 
 
 def load_checkpoint(path: Path, key: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and numbers of a checkpoint."""
-    read_bytes(path, MOST_ARRAYS)  # a regular file of a size that can be
+    """Read tensors and numbers of a checkpoint."""
+    read_bytes(path, MOST_ARRAYS)  # refuses special and oversized files
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

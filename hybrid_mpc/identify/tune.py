@@ -1,6 +1,6 @@
 """Search of training settings by the validation error of free runs (Optuna): resumable, pruned, repeatable.
 
-What may vary (:class:`SearchSpace`), the search, and its journal: Optuna's, in lines of JSON, bound to its search.
+The journal of a search is Optuna's (JSON lines); it belongs to one search and cannot continue another one.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ Values = Mapping[str, float]
 Progress = Callable[[int, int, int, float], None]
 STUDY = "hybrid-mpc tune"
 STARTUP = 6
-"""Trials at random before the sampler looks at their results."""
+"""Number of random trials before the sampler uses results."""
 FINISHED = 4
-"""Finished trainings that a median is taken of before one is pruned by it."""
+"""Minimum number of finished trainings before a training is pruned by their median."""
 PATIENCE = 0.2
-"""Share of the optimiser steps that every training gets: a good setting may start slowly."""
+"""Share of the optimizer steps without pruning, because a good setting may start slowly."""
 ENOUGH = 8
-"""Finished trainings from which the settings' importance is estimated."""
+"""Minimum number of finished trainings for an estimate of the settings' importance."""
 WHOLE = ("hidden", "batch", "horizon")
 """Settings that are whole numbers."""
 USUAL: Mapping[str, tuple[float, float]] = {
@@ -50,27 +50,28 @@ USUAL: Mapping[str, tuple[float, float]] = {
     "horizon": (20, 100),
     "prior_replay": (0.3, 300.0),
 }
-"""Bounds of a setting that is searched without bounds of its own."""
+"""Default bounds of a searched setting."""
 
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """Settings that are searched, each between two bounds on a logarithmic scale; None leaves one as it is.
+    """Searched settings, each between two bounds on a logarithmic scale; None: not searched.
 
     Args:
         hidden: Hidden units z, whole numbers. Default: 4 to 64.
-        learning_rate: Start of the schedule of teacher forcing; its end keeps the ratio that the base has.
+        learning_rate: Initial learning rate of teacher forcing; the ratio of final to initial rate is that of the base.
             Default: 0.002 to 0.05.
-        free_run_learning_rate: The same of the free runs. Default: 0.0005 to 0.02.
+        free_run_learning_rate: Initial learning rate of the free runs, likewise. Default: 0.0005 to 0.02.
         decay: Weight decay times the number of training samples. Default: 10 to 30000.
-        batch: Windows a step, whole numbers. Default: not searched; twice the batch is twice the work.
-        horizon: Most scored periods of a free-run window, whole numbers. Default: not searched; twice the
-            horizon is twice the work.
-        prior_replay: Weight of prior replay. Default: not searched. Zero is on no logarithmic scale: compare with a
-            search without it.
+        batch: Number of windows in a step, whole numbers. Default: not searched; the computing time is proportional to
+            it.
+        horizon: Maximum evaluated periods of a free-run window, whole numbers. Default: not searched; the computing
+            time is proportional to it.
+        prior_replay: Weight of prior replay. Default: not searched. A logarithmic scale excludes zero; compare with a
+            search without prior replay.
 
     Raises:
-        InputError: If nothing is searched, or bounds are not positive, not rising, or not whole where they must be.
+        InputError: If no setting is searched, or bounds are not positive, not increasing, or not whole numbers.
 
     Example:
         >>> SearchSpace(hidden=(8, 32), decay=None).names
@@ -97,16 +98,16 @@ class SearchSpace:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Settings that are searched."""
+        """Names of the searched settings."""
         return tuple(name for name, bounds in asdict(self).items() if bounds is not None)
 
     def bounds(self, name: str) -> tuple[float, float]:
-        """Bounds of a setting that is searched."""
+        """Bounds of a searched setting."""
         low, high = getattr(self, name)
         return low, high
 
     def values_of(self, settings: TrainingSettings) -> dict[str, float]:
-        """What the searched settings are in ``settings``."""
+        """Values of the searched settings in ``settings``."""
         rates = settings.learning_rates
         own = {"learning_rate": rates[0], "free_run_learning_rate": rates[2]}
         return {name: own[name] if name in own else getattr(settings, name) for name in self.names}
@@ -116,7 +117,7 @@ class SearchSpace:
         return all(self.bounds(n)[0] <= values[n] <= self.bounds(n)[1] for n in self.names)
 
     def apply(self, base: TrainingSettings, values: Values) -> TrainingSettings:
-        """``base`` with the values in it."""
+        """Replace settings of ``base`` by values."""
         start, end, free_start, free_end = base.learning_rates
         rate = values.get("learning_rate", start)
         free = values.get("free_run_learning_rate", free_start)
@@ -137,9 +138,9 @@ class SearchSpace:
 
 
 def parsed_space(texts: Sequence[str]) -> SearchSpace:
-    """A space from ``NAME`` or ``NAME=LOW:HIGH`` for each setting, e.g. ``["hidden=8:32", "batch"]``.
+    """Parse a space from ``NAME`` or ``NAME=LOW:HIGH`` for each setting, e.g. ``["hidden=8:32", "batch"]``.
 
-    A name alone has its usual bounds; settings that are not named stay as they are. No text gives the default space.
+    A name alone has its default bounds; other settings are not searched. Without texts, the space is the default one.
     """
     if not texts:
         return SearchSpace()
@@ -184,15 +185,15 @@ class TrialRow:
     """One training of a search.
 
     Args:
-        number: 0, 1, ...
-        state: ``"complete"``, ``"pruned"`` (stopped while worse than the median of the finished ones at the same
-            step) or ``"diverged"`` (no network had a finite validation error).
-        value: Validation error of the best network [unit of E_sim]; of a pruned training that at its end, of a
-            diverged one infinite.
+        number: Number of the trial: 0, 1, ...
+        state: ``"complete"``, ``"pruned"`` (stopped because it was worse than the median of the finished trainings at
+            the same step) or ``"diverged"`` (no network has a finite validation error).
+        value: Validation error of the best network [unit of E_sim]; the last value of a pruned training; infinite for a
+            diverged one.
         mean: Mean of the networks' validation errors; NaN for a pruned training.
-        steps: Optimiser steps done.
-        duration: How long it took [s].
-        values: The searched settings.
+        steps: Number of optimizer steps.
+        duration: Duration [s].
+        values: Values of the searched settings.
     """
 
     number: int
@@ -206,16 +207,16 @@ class TrialRow:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search found.
+    """Result of a search.
 
     Args:
-        settings: The best training's settings; :func:`~hybrid_mpc.identify.train.train` with them gives
+        settings: Settings of the best training; :func:`~hybrid_mpc.identify.train.train` with these settings gives
             ``best.value`` again.
         best: The best training.
-        base: Validation error with the settings that the search started from; None where the space does not hold them.
+        base: Validation error with the initial settings; None if these are outside the space.
         trials: All trainings.
-        importance: Share of each setting in the differences of the finished trainings' values (PED-ANOVA, sums to
-            one); empty where fewer than eight finished or one setting alone is searched.
+        importance: Share of each setting in the variation of the finished trainings' errors (PED-ANOVA, sum one); empty
+            with fewer than eight finished trainings or a single searched setting.
     """
 
     settings: TrainingSettings
@@ -238,28 +239,28 @@ def tune(
     on_progress: Progress = lambda number, done, total, error: None,
     timeout: float | None = None,
 ) -> SearchResult:
-    """Search settings by the validation error of free runs, the best network of each training counting.
+    """Search settings by the free-run validation error of the best network of each training.
 
-    The first training has the settings ``base``, if the space holds them. Settings are drawn from (seed, number of
-    the trial, results so far), and an interrupted training is drawn again: a search that was killed and resumed is the
-    search that was not. Validation also chooses the weights within a training, so the best value is somewhat too
-    good; evaluate on test runs.
+    The first training has the settings ``base`` if the space contains them. Settings depend on seed, number of the
+    trial and previous results only, and an interrupted training is repeated. So an interrupted and resumed search has
+    the same result. Validation also selects the weights within a training, so the best value is optimistic; evaluate on
+    test runs.
 
     Args:
         prior: The fitted prior.
         training: Training trajectories.
-        validation: Validation trajectories; the only ones that decide.
-        base: All settings that are not searched, and the first trial's.
-        space: What is searched.
-        trials: Trials in all, those in ``storage`` counted.
-        storage: Journal (JSON lines), made if missing, resumed if there. One search at a time.
-        seed: Seed of the search; weights and batches have that of ``base``.
-        on_progress: ``(number of the trial, steps done, steps in all, best validation error)``.
-        timeout: No further trial starts after this time of the call [s]; one trial is made in any case. Default: none.
+        validation: Validation trajectories, which alone determine the result.
+        base: Settings that are not searched, and the settings of the first trial.
+        space: Searched settings.
+        trials: Total number of trials, with those in ``storage``.
+        storage: Journal (JSON lines); created if missing, else the search continues. One search at a time.
+        seed: Seed of the search; weights and batches use the seed of ``base``.
+        on_progress: ``(number of the trial, steps done, steps in total, best validation error)``.
+        timeout: No further trial starts after this time [s]; there is at least one trial. Default: none.
 
     Raises:
-        InputError: If the journal is damaged or of another search, a number is too small, all trainings diverged, or
-            the data are such that :func:`~hybrid_mpc.identify.train.train` refuses them.
+        InputError: If the journal is damaged or belongs to another search, a number is too small, all trainings
+            diverged, or :func:`~hybrid_mpc.identify.train.train` refuses the data.
 
     Example:
         >>> found = tune(prior, train_runs, valid_runs, base, SearchSpace(), trials=20,
@@ -275,14 +276,14 @@ def tune(
         trial = _ask(study, number, base, space, seed)
         settings = space.apply(base, trial.params)
         own = partial(train, prior, training, validation, settings)
-        _tried(study, trial, own, partial(on_progress, number))
+        _run_trial(study, trial, own, partial(on_progress, number))
         if timeout is not None and time.monotonic() - start >= timeout:
             break
     return _result(study, base, space)
 
 
 def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
-    """Refuse numbers that no search can be made with."""
+    """Check the numbers of a search."""
     if trials < 1 or seed < 0 or (timeout is not None and not timeout > 0):
         raise InputError(
             f"search: give trials of at least 1, a seed of at least 0 and a timeout above 0 s; got "
@@ -290,13 +291,13 @@ def check_numbers(trials: int, seed: int, timeout: float | None) -> None:
         )
 
 
-def _tried(
+def _run_trial(
     study: optuna.Study,
     trial: Trial,
     training: Callable[..., Trained],
     on_progress: Callable[[int, int, float], None],
 ) -> None:
-    """Make a trial's training and store how it ended; one that is interrupted stays open and is drawn again."""
+    """Run the training of a trial and store its result; an interrupted trial stays open and is repeated."""
 
     def report(done: int, total: int, error: float) -> None:
         trial.report(error, done)
@@ -314,7 +315,7 @@ def _tried(
 
 
 def _ask(study: optuna.Study, number: int, base: TrainingSettings, space: SearchSpace, seed: int) -> Trial:
-    """The trial of this number: the base first, then what (seed, number) and the finished trials give."""
+    """Draw the trial of a number: first the base, then from seed, number and finished trials."""
     own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
     study.sampler = optuna.samplers.TPESampler(seed=own, n_startup_trials=STARTUP)
     values = space.values_of(base)
@@ -331,7 +332,7 @@ def _identity(
     space: SearchSpace,
     seed: int,
 ) -> dict[str, str]:
-    """Hashes of everything that decides what the trials are."""
+    """Hashes of all arguments that the trials depend on."""
     data = hashlib.sha256()
     for trajectory in (*training, *validation):
         data.update(f"{trajectory.role} {trajectory.dt} {trajectory.x.shape}".encode())
@@ -386,13 +387,13 @@ def _row(number: int, trial: FrozenTrial) -> TrialRow:
 
 
 def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
-    """The study of a journal, whose trials are all finished or given up."""
+    """Open the study of a journal; unfinished trials are closed as failed."""
     storage.parent.mkdir(parents=True, exist_ok=True)
     _mend(storage)
     verbosity = optuna.logging.get_verbosity()
-    optuna.logging.set_verbosity(optuna.logging.WARNING)  # not that a study was made or found
+    optuna.logging.set_verbosity(optuna.logging.WARNING)  # no message about a created or loaded study
     try:
-        # whole path: a lock is a link to it, which has to lead somewhere
+        # absolute path, because the lock is a symbolic link to it
         journal = JournalStorage(JournalFileBackend(str(storage.resolve())))
         make = optuna.load_study if STUDY in optuna.get_all_study_names(journal) else optuna.create_study
         study = make(storage=journal, study_name=STUDY)
@@ -404,14 +405,14 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
         ) from error
     finally:
         optuna.logging.set_verbosity(verbosity)
-    if not found and not study.trials:  # new, or killed before it was named
+    if not found and not study.trials:  # new, or interrupted before its identity was written
         study.set_user_attr("identity", dict(identity))
     elif differ := [name for name in identity if found.get(name) != identity[name]]:
         raise InputError(
             f"{storage}: belongs to another search ({', '.join(differ)} differ). Continue with the same settings, or "
             "choose another file [HM-IDENTIFY-065]"
         )
-    for _ in study.get_trials(states=(TrialState.WAITING,)):  # drawn, not begun, when the search was ended
+    for _ in study.get_trials(states=(TrialState.WAITING,)):  # drawn but not started before the interruption
         study.ask()
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
         study.tell(trial.number, state=TrialState.FAIL)
@@ -419,7 +420,7 @@ def open_study(storage: Path, identity: Mapping[str, str]) -> optuna.Study:
 
 
 def _mend(storage: Path) -> None:
-    """Cut off a line that a kill left unfinished."""
+    """Remove an incomplete last line after an interruption."""
     if storage.is_file():
         content = read_bytes(storage, MOST_CONTENT)
         whole = content.rfind(b"\n") + 1

@@ -1,4 +1,4 @@
-"""Windows of recordings that a prior is fitted to, and what is known of their first states."""
+"""Windows of recordings for the fit of a prior, and knowledge about their initial states."""
 
 from __future__ import annotations
 
@@ -19,34 +19,33 @@ from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 WINDOWS = 100
-"""Windows of a length at most, evenly chosen. Where a prior lacks something, its parameters depend on which parts of
-the recordings are fitted: with half of them errors on held-out recordings scatter by a tenth."""
+"""Maximum number of windows of one length, evenly chosen. If a prior lacks an effect, its parameters depend on the
+fitted parts of the recordings: with half as many windows, errors on held-out recordings scatter by 10 %."""
 FEW = 24
-"""The same where starts are compared, where a delay is looked for, and of predictions."""
+"""Maximum number of windows for the comparison of starts, the test for a delay, and predictions."""
 LONGEST = 20_000
-"""Periods of a whole recording at most: longer ones are cut."""
+"""Maximum periods of a whole recording; longer ones are cut."""
 PUNCTUAL = 0.01
-"""Share of a period by which one trajectory may begin late or early to be the next part of another."""
+"""Tolerance, in periods, of the start of a trajectory that continues another one."""
 COMPARED_SAMPLES = 1000
-"""First samples by which trajectories of the same length are put in order."""
+"""Number of first samples that sort trajectories of equal length."""
 
 
 @dataclass(frozen=True)
 class FirstStates:
-    """What is known of the first states of a fit's free runs.
+    """Knowledge about the initial states of a fit's free runs.
 
     Args:
-        kind: ``"free"``: nothing, they are found with the parameters. ``"known"``: ``values`` are those of a
-            trajectory's own first sample, for example of a machine that rests before it is started; the others are
-            free. ``"measured"``: outputs that are states, by their names, are exact wherever a run starts; the others
-            are free.
-            ``"shared"``: all trajectories start from one state, which is free. ``"warm_up"``: a run's first ``seconds``
-            alone tell its first state, and what follows alone counts, as where models are evaluated.
-        values: Values [their units] of the states that are known, by name.
+        kind: ``"free"``: unknown; initial states are fitted. ``"known"``: ``values`` hold at the first sample of each
+            trajectory, for example of a machine that starts at rest; other states are free. ``"measured"``: outputs
+            with the name of a state are exact initial values; other states are free. ``"shared"``: all trajectories
+            start from the same free state. ``"warm_up"``: the first ``seconds`` of a run only determine its initial
+            state; errors are counted on the rest, as in the evaluation of models. Default: ``"free"``.
+        values: Values [their units] of the known states by name.
         seconds: Length [s] of the warm-up.
 
     Raises:
-        InputError: If ``values`` or ``seconds`` do not belong to the kind, or are missing.
+        InputError: If ``values`` or ``seconds`` do not match the kind.
 
     Example:
         >>> FirstStates("known", {"phi_dot": 0.0}).values
@@ -78,14 +77,14 @@ class FirstStates:
         refuse(problems)
 
     def samples(self, dt: float) -> int:
-        """Samples of the warm-up, none without."""
+        """Samples of the warm-up; 0 without a warm-up."""
         return scales.periods(self.seconds, dt, 2) if self.kind == "warm_up" else 0
 
     def check(self, prior: Prior, largest_delay: float) -> None:
-        """Refuse what does not fit to a prior.
+        """Check that the initial states match a prior.
 
         Raises:
-            InputError: With all that does not.
+            InputError: If they do not match; lists all errors together.
         """
         names, outputs = ([s.name for s in signals] for signals in (prior.states, prior.outputs))
         problems = [
@@ -112,12 +111,19 @@ FREE = FirstStates()
 
 @dataclass(frozen=True)
 class OutputWindows:
-    """Windows of recordings: ``y`` ``(n, T + 1, n_y)`` with NaN where nothing was measured, ``u`` ``(n, lead + T + 1,
-    n_u)``, of which the first ``lead`` come before the window, ``w`` ``(n, T + 1, n_w)``, a guess ``x`` ``(n, n_x)`` of
-    the first state, and which samples are censored ``(n, T + 1, n_y)``.
+    """Windows of recordings.
 
-    Of the first states ``known`` ``(n, n_x)`` are as guessed. Windows of one group ``(n,)`` begin in the same state. Of
-    a window the first ``warm`` samples alone tell its first state, and the others count; 0: all do both.
+    Args:
+        y: Measured outputs ``(n, T + 1, n_y)``; NaN for a missing sample.
+        u: Inputs ``(n, lead + T + 1, n_u)``; the first ``lead`` samples lie before the window.
+        w: Disturbances ``(n, T + 1, n_w)``.
+        x: Guess of the initial states ``(n, n_x)``.
+        censored: +1 or -1 for samples at the upper or lower end of a sensor, else 0, ``(n, T + 1, n_y)``.
+        lead: Number of input samples before the window.
+        known: Mask of the initial states whose guess is exact ``(n, n_x)``.
+        group: Group of each window ``(n,)``; windows of a group have the same initial state.
+        warm: The first ``warm`` samples of a window only determine its initial state; errors are counted on the rest.
+            Default 0: all samples serve both.
     """
 
     y: Array
@@ -131,12 +137,12 @@ class OutputWindows:
     warm: int = 0
 
     def beginning(self, periods: int) -> OutputWindows:
-        """The first so many periods of each."""
+        """Cut each window after ``periods`` periods."""
         y, w, censored = (v[:, : periods + 1] for v in (self.y, self.w, self.censored))
         return replace(self, y=y, u=self.u[:, : self.lead + periods + 1], w=w, censored=censored)
 
     def times(self, n: int) -> OutputWindows:
-        """The same windows, ``n`` times one behind the other."""
+        """Repeat the windows ``n`` times, one behind the other."""
         y, u, w, x, censored, known = (
             np.concatenate([v] * n) for v in (self.y, self.u, self.w, self.x, self.censored, self.known)
         )
@@ -155,11 +161,17 @@ def cut_outputs(
     outputs: Sequence[Signal] = (),
     first: FirstStates = FREE,
 ) -> OutputWindows:
-    """At most ``most`` windows of ``periods``, one behind the other, evenly chosen; or whole trajectories.
+    """Cut at most ``most`` windows of ``periods``, without overlap and evenly chosen; or take whole trajectories.
 
-    Whole ones are cut where they are longer than ``LONGEST``, and filled up with missing samples to the longest.
-    First states are guessed within the ranges of ``states``. Default: as the trajectories have them. What is known of
-    them by their names, and by those of the ``outputs``, says ``first``; it needs ``states``.
+    Args:
+        trajectories: Trajectories with estimated states.
+        periods: Length of a window; None: whole trajectories, cut after ``LONGEST`` periods and filled up with missing
+            samples.
+        lead: Number of input samples before a window.
+        most: Maximum number of windows.
+        states: Signals of the states; guesses of initial states are clipped to their ranges. Default: no clipping.
+        outputs: Signals of the outputs, for ``first``.
+        first: Knowledge about initial states; needs ``states``. Default: none.
 
     Raises:
         InputError: If no trajectory is long enough.
@@ -176,7 +188,7 @@ def cut_outputs(
                 f"{lead} samples before it needs {periods + lead + 1}. Give longer recordings [HM-IDENTIFY-073]"
             )
         chosen = [starts[i] for i in evenly(len(starts), most)]
-        if first.kind in ("known", "shared"):  # what is known is known of a recording's own first sample
+        if first.kind in ("known", "shared"):  # this knowledge is about the first sample of a recording
             begins = [one for one in starts if one[1] == 0][:most]
             others = [one for one in starts if one[1] > 0]
             chosen = begins + [others[i] for i in evenly(len(others), most - len(begins))]
@@ -217,16 +229,16 @@ def cut_outputs(
 
 
 def place_among(trajectory: Trajectory) -> tuple[int, list[float]]:
-    """Place of a trajectory among others, by what was measured alone."""
+    """Sort key of a trajectory: its length, then its measured samples."""
     first = np.hstack([trajectory.y, trajectory.u])[:COMPARED_SAMPLES]
     return len(trajectory.t), np.nan_to_num(first, nan=-math.inf).ravel().tolist()
 
 
 def continued(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Join the trajectories of files that follow each other within a period: a logger had begun a new file.
+    """Join trajectories of files that follow each other within one period (the logger began a new file).
 
-    Two trajectories stay apart where an output jumps between them by more than within either (the machine was moved),
-    and where they come from one file (it was cut on purpose).
+    Two trajectories are not joined if an output jumps between them by more than within each of them (the machine was
+    moved), or if they come from one file (which was cut on purpose).
 
     Example:
         >>> from scenarios.pendulum.data import exact_runs
@@ -238,7 +250,7 @@ def continued(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     found: list[Trajectory] = []
     for t in sorted(trajectories, key=lambda t: float(t.t[0])):
         before = [i for i, one in enumerate(found) if _follows(one, t)]
-        if len(before) != 1:  # none, or several recordings of the same time
+        if len(before) != 1:  # no predecessor, or several recordings of the same time
             found.append(t)
             continue
         one = found[before[0]]
@@ -251,7 +263,7 @@ def continued(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
 
 
 def _follows(one: Trajectory, other: Trajectory) -> bool:
-    """Whether the other trajectory begins a period after the end of the one, in a new file, and no output jumps."""
+    """Whether the other trajectory starts one period after the end of the first, in a new file, without a jump."""
     if one.file == other.file or not abs(float(other.t[0] - one.t[-1]) / one.dt - 1.0) < PUNCTUAL:
         return False
     jump = np.abs(other.y[0] - one.y[-1])

@@ -57,7 +57,9 @@ class Fault:
 
     def __post_init__(self) -> None:
         own = Fields(self, f"fault {self.target}")
-        own.need("target", lambda: self.target in SIGNAL_TARGETS or self.on_plant, _unknown(self.target))
+        own.need(
+            "target", lambda: self.target in SIGNAL_TARGETS or self.on_plant, _explain_unknown(self.target)
+        )
         own.need(
             "start end",
             lambda: self.start < self.end,
@@ -102,7 +104,7 @@ EFFECTS: Mapping[str, Callable[[Fault, float, float, float], float]] = {
 SIGNAL_TARGETS = tuple(EFFECTS)
 
 
-def _unknown(target: object) -> str:
+def _explain_unknown(target: object) -> str:
     near = difflib.get_close_matches(str(target), SIGNAL_TARGETS, 1)
     meant = f"; did you mean {near[0]!r}? There are" if near else "; known"
     targets = ", ".join(SIGNAL_TARGETS)
@@ -188,7 +190,7 @@ def corrupt_measurement(
 
     ``outputs`` are the names of the outputs, needed if a fault names one.
     """
-    return _corrupted(faults, t, y, y_before, outputs, "measurement_")
+    return _corrupt(faults, t, y, y_before, outputs, "measurement_")
 
 
 def corrupt_input(faults: Sequence[Fault], t: float, u: Array, inputs: Sequence[str] = ()) -> Array:
@@ -196,10 +198,10 @@ def corrupt_input(faults: Sequence[Fault], t: float, u: Array, inputs: Sequence[
 
     ``inputs`` are the names of the inputs, needed if a fault names one.
     """
-    return _corrupted(faults, t, u, u, inputs, "input_")
+    return _corrupt(faults, t, u, u, inputs, "input_")
 
 
-def _corrupted(
+def _corrupt(
     faults: Sequence[Fault], t: float, now: Array, before: Array, names: Sequence[str], kind: str
 ) -> Array:
     values = now.copy()

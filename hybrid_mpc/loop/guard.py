@@ -207,7 +207,7 @@ class GuardedController:
         safe, known = self.safe, estimate
         if state.mode is Mode.BACKUP and state.backup is not None:
             safe, known = self._backup, state.backup
-        before, state = self._handed(state, previous, safe, known)
+        before, state = self._hand_over(state, previous, safe, known)
         if late:
             return safe.late(before, known, reference, limits=bounds), state
         if state.mode is Mode.FALLBACK:
@@ -220,7 +220,7 @@ class GuardedController:
         if state.wanted in (Mode.FALLBACK, Mode.REST):
             return None
         safe = self._backup if state.wanted is Mode.BACKUP and state.backup is not None else self.safe
-        return safe.prepare(decision, weight) if self._planner(safe) == state.planner else None
+        return safe.prepare(decision, weight) if self._name_planner(safe) == state.planner else None
 
     def watched(self, state: GuardState, t: float, reading: Any) -> GuardState:
         """State after the monitor's reading of the period at ``t``, which determines the next period's mode."""
@@ -251,14 +251,14 @@ class GuardedController:
             wanted = state.mode
         return replace(state, wanted=wanted, why=why, alarm=alarm, doubt=doubt, frozen=frozen)
 
-    def _planner(self, safe: SafeController) -> Literal["controller", "backup"]:
+    def _name_planner(self, safe: SafeController) -> Literal["controller", "backup"]:
         return "controller" if safe is self.safe else "backup"
 
-    def _handed(
+    def _hand_over(
         self, state: GuardState, previous: Decision, safe: SafeController, estimate: Estimate
     ) -> tuple[Decision, GuardState]:
         """The previous decision as one of ``safe``: the inputs of its plan, simulated with the model of ``safe``."""
-        planner = self._planner(safe)
+        planner = self._name_planner(safe)
         if planner == state.planner:
             return previous, state
         finite = replace(

@@ -225,11 +225,13 @@ class Loop:
         """
         if in_time is not None:
             check_function(in_time, "in_time")
-        sample, measured = self._sample(y), self._disturbed(w)
-        x_ref, factors = self._preview(0, reference)
-        estimate = self._estimator.start(self._seen(sample, truth), 0.0, **self._now_measured(measured))
+        sample, measured = self._sample(y), self._check_disturbances(w)
+        x_ref, factors = self._read_preview(0, reference)
+        estimate = self._estimator.start(
+            self._choose_measurement(sample, truth), 0.0, **self._select_measured(measured)
+        )
         until = None if applied is None else sampled(applied, (self.ocp.n_u,), "applied")
-        ahead = self._w_ahead(0, measured, estimate)
+        ahead = self._predict_disturbances(0, measured, estimate)
         first = self._safe.initial(estimate, until, x_ref, factors, ahead)
         self._state = self._first_state(sample, estimate, first)
         self._ahead, self.reading, self.spent = None, None, dict.fromkeys(TIMED, 0.0)
@@ -268,15 +270,15 @@ class Loop:
         if in_time is not None:
             check_function(in_time, "in_time")
         self.finish()
-        sample, measured, state = self._sample(y), self._disturbed(w), self.state
+        sample, measured, state = self._sample(y), self._check_disturbances(w), self.state
         previous, inputs = state.decision, state.inputs
         if applied is not None:
-            previous = _with_input(previous, sampled(applied, (self.ocp.n_u,), "applied"))
+            previous = _replace_input(previous, sampled(applied, (self.ocp.n_u,), "applied"))
             inputs = (*inputs[:-1], previous.u)
         begin, k = self._now(), state.k + 1
-        x_ref, factors = self._preview(k, reference)
-        seen = self._seen(sample, truth)
-        also = self._now_measured(measured)
+        x_ref, factors = self._read_preview(k, reference)
+        seen = self._choose_measurement(sample, truth)
+        also = self._select_measured(measured)
         if state.estimate is None:
             estimate = self._estimator.start(seen, k * self.model.dt, **also)
         else:
@@ -292,16 +294,16 @@ class Loop:
         """The input of this period, by the controller of the guard's mode or by the operator."""
         state, estimate = self.state, self.estimate
         self.previewed = x_ref, factors
-        w = self._w_ahead(state.k, measured, estimate)
-        now = self._now_measured(measured).get("w")
+        w = self._predict_disturbances(state.k, measured, estimate)
+        now = self._select_measured(measured).get("w")
         guard = self._control.measured(state.guard, self.t, state.y, previous.u, now)
         self._decide_late = partial(self._control.decide, guard, previous, estimate, x_ref, late=True)
         may_solve = in_time is None or in_time()
         begin = self._now()
         if state.mode == "manual":
-            decision = self._operated(previous, estimate)
+            decision = self._follow_operator(previous, estimate)
         else:
-            prepared = self._prepared(previous, factors)
+            prepared = self._take_preparation(previous, factors)
             decision, guard = self._control.decide(
                 guard, previous, estimate, x_ref, factors, prepared=prepared, late=not may_solve, w=w
             )
@@ -366,7 +368,7 @@ class Loop:
         m = self.model
         trial, y = copy(self), m.output(m.x0, m.u0, m.w, m.p).full().ravel()
         truth = np.concatenate([m.x0, np.zeros(m.n_h)])
-        x_ref, factors = self._preview(0, None)
+        x_ref, factors = self._read_preview(0, None)
         estimate = self._estimator.start(truth if self._truth else y, 0.0)
         first = self._safe.initial(estimate)
         trial._state, trial._ahead = self._first_state(y, estimate, first), None
@@ -449,7 +451,7 @@ class Loop:
             np.full(self.model.n_y, np.nan) if y is None else sampled(y, (self.model.n_y,), "the measurement")
         )
 
-    def _disturbed(self, w: ArrayLike | None) -> Array | None:
+    def _check_disturbances(self, w: ArrayLike | None) -> Array | None:
         """Measured disturbances ``(m, n_w)``, a row for the present and each known period; None if not measured."""
         if w is None:
             return None
@@ -460,13 +462,13 @@ class Loop:
             )
         return rows
 
-    def _now_measured(self, measured: Array | None) -> dict[str, Array]:
+    def _select_measured(self, measured: Array | None) -> dict[str, Array]:
         """Keyword argument ``w`` of the estimator; empty if the model has no measured disturbances."""
         if not self.model.n_w:
             return {}
         return {"w": np.full(self.model.n_w, np.nan) if measured is None else measured[0]}
 
-    def _w_ahead(self, k: int, measured: Array | None, estimate: Estimate) -> Array | None:
+    def _predict_disturbances(self, k: int, measured: Array | None, estimate: Estimate) -> Array | None:
         """Measured disturbances ``(m, n_w)`` in the solve of period k; None: those of the estimate."""
         if measured is not None and len(measured) > 1:
             return held(measured[self._delay :] if len(measured) > self._delay else measured[-1:], estimate.w)
@@ -477,7 +479,7 @@ class Loop:
             ahead[0] = estimate.w
         return held(ahead, estimate.w)
 
-    def _seen(self, sample: Array, truth: ArrayLike | None) -> Array:
+    def _choose_measurement(self, sample: Array, truth: ArrayLike | None) -> Array:
         """Input of the estimator: the sample, or the truth."""
         if not self._truth:
             return sample
@@ -487,7 +489,7 @@ class Loop:
             )
         return sampled(truth, (None,), "the truth")
 
-    def _preview(self, k: int, reference: ArrayLike | None) -> tuple[Array, Array | None]:
+    def _read_preview(self, k: int, reference: ArrayLike | None) -> tuple[Array, Array | None]:
         """Reference and factors of period k, at the times at which its inputs act."""
         if self._ahead is not None and self._ahead.k == k:
             x_ref, factors = self._ahead.previews
@@ -501,7 +503,7 @@ class Loop:
                 )
         return x_ref, factors
 
-    def _prepared(self, previous: Decision, weight: Array | None) -> Any:
+    def _take_preparation(self, previous: Decision, weight: Array | None) -> Any:
         """The preparation of :meth:`finish`, if it belongs to this solve."""
         ahead = self._ahead
         if ahead is None or ahead.decision is not previous:
@@ -510,7 +512,7 @@ class Loop:
         same = used is weight or (used is not None and weight is not None and np.array_equal(used, weight))
         return ahead.prepared if same else None
 
-    def _operated(self, previous: Decision, estimate: Estimate) -> Decision:
+    def _follow_operator(self, previous: Decision, estimate: Estimate) -> Decision:
         """Decision in manual mode: the operator's input, and a plan from which automatic mode can start."""
         u, plan = previous.u, previous.solution
         if estimate.finite and np.all(np.isfinite(u)):
@@ -519,7 +521,7 @@ class Loop:
         return Decision(u, Source.MANUAL, plan, Status.INITIAL, 0)
 
 
-def _with_input(decision: Decision, u: Array) -> Decision:
+def _replace_input(decision: Decision, u: Array) -> Decision:
     """The decision with the applied input ``u``; non-finite entries are those of the decision."""
     u = np.where(np.isfinite(u), u, decision.u)
     if np.array_equal(u, decision.u):

@@ -115,7 +115,7 @@ class SimulatedMachine:
         self._outputs, self._inputs = outputs, inputs
         self._rng = np.random.default_rng(seed)
         self.state = plant.reset(x0, seed)
-        self._measurements = [self._sensor() for _ in range(sensor_delay)]
+        self._measurements = [self._read_sensor() for _ in range(sensor_delay)]
         self._input_delay = input_delay
         self._y = np.full(self._n_y, np.nan)
         self._commands: list[Array] = []
@@ -123,7 +123,7 @@ class SimulatedMachine:
 
     def measure(self, t: float) -> Array:
         """The measurement that arrives at ``t``."""
-        self._measurements.append(self._sensor())
+        self._measurements.append(self._read_sensor())
         self._y = corrupt_measurement(self._faults, t, self._measurements.pop(0), self._y, self._outputs)
         return self._y
 
@@ -144,5 +144,5 @@ class SimulatedMachine:
         step: Any = plant.step
         self.state = step(self.state, u, self._dt, *(() if w is None else (w,)))
 
-    def _sensor(self) -> Array:
+    def _read_sensor(self) -> Array:
         return sampled(self._plant.measure(self.state, self._rng), (self._n_y,), "the plant's measurement")

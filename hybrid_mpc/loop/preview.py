@@ -37,11 +37,11 @@ class Previews:
     def __call__(self, t: float) -> tuple[Array, Array | None]:
         """Reference and factors (None for 1) from ``t`` on."""
         times = t + self._ahead
-        x_ref = self._over(self._reference, times, "reference", self._columns)
-        weight = None if self._weight is None else self._over(self._weight, times, "weight", self._n_x)
+        x_ref = self._evaluate(self._reference, times, "reference", self._columns)
+        weight = None if self._weight is None else self._evaluate(self._weight, times, "weight", self._n_x)
         return x_ref, weight
 
-    def _over(self, preview: Preview, times: Array, name: str, columns: int) -> Array:
+    def _evaluate(self, preview: Preview, times: Array, name: str, columns: int) -> Array:
         values = floats(preview(times), f"what {name} returns")
         if values.shape != (times.size, columns):
             raise InputError(

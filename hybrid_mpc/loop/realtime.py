@@ -203,7 +203,7 @@ class Runner:
             run.begin()
             while n is None or run.k < n:
                 end.check()
-                if stop is not None and _stops(stop()):
+                if stop is not None and _read_answer(stop()):
                     ended = "stop"
                     break
                 run.period()
@@ -225,7 +225,7 @@ class Runner:
         return round(duration / dt)
 
 
-def _stops(answer: object) -> bool:
+def _read_answer(answer: object) -> bool:
     """The answer of ``stop()`` as a bool."""
     try:
         return bool(answer)
@@ -476,7 +476,7 @@ class SafeEnd:
 
     def __init__(self, hand_over: Callable[[], object]) -> None:
         self._hand_over = hand_over
-        self._handler, self._armed = self._signalled, False
+        self._handler, self._armed = self._receive_signal, False
         self._previous: dict[int, Any] = {}
         self._signals: list[int] = []
         self._exiting, self._over = False, threading.Event()
@@ -508,7 +508,7 @@ class SafeEnd:
                     self._previous[number] = before
                     signal.signal(number, self._handler)
         else:
-            atexit.register(self._at_exit)
+            atexit.register(self._wait_at_exit)
         self._armed = True
         return self
 
@@ -516,13 +516,13 @@ class SafeEnd:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> bool:
         self._armed = False
-        failure = self._handed_over()
+        failure = self._apply_safe_input()
         for number, before in self._previous.items():
             if signal.getsignal(number) is self._handler:
                 signal.signal(number, before)
         self._over.set()
         if not self._exiting:
-            atexit.unregister(self._at_exit)
+            atexit.unregister(self._wait_at_exit)
         if failure is not None and self._signals:  # the signal may end the process: print now
             traceback.print_exception(failure)
         _deliver(list(dict.fromkeys(self._signals)))
@@ -530,7 +530,7 @@ class SafeEnd:
             raise failure
         return isinstance(error, Ended)
 
-    def _handed_over(self) -> SafeInputError | None:
+    def _apply_safe_input(self) -> SafeInputError | None:
         failures: list[BaseException] = []
         for pause in (0.0, *PAUSES_S):
             try:
@@ -547,13 +547,13 @@ class SafeEnd:
         error.__cause__ = failures[0]
         return error
 
-    def _signalled(self, number: int, frame: FrameType | None) -> None:
+    def _receive_signal(self, number: int, frame: FrameType | None) -> None:
         self._signals.append(number)
         entering_or_leaving = frame is not None and frame.f_code in _OWN
         if self._armed and not entering_or_leaving:
             raise Ended(self.cause)
 
-    def _at_exit(self) -> None:
+    def _wait_at_exit(self) -> None:
         """At the end of the interpreter, wait for the block's end, unless its thread belongs to a parent process."""
         self._exiting = True
         if self._thread.is_alive():

@@ -128,7 +128,7 @@ def simulate(
             check_function(function, name)
     if not isinstance(stage_cost, OCP | None):
         raise InputError(f"stage_cost: give an OCP, got {type(stage_cost).__name__} [HM-LOOP-043]")
-    if isinstance(faults, str | bytes) or not all(isinstance(fault, Fault) for fault in _listed(faults)):
+    if isinstance(faults, str | bytes) or not all(isinstance(fault, Fault) for fault in _list_items(faults)):
         raise InputError(f"faults: give a list of Fault, got {type(faults).__name__} [HM-LOOP-044]")
     seed = whole(seed, "seed", 0, 2**63 - 1)
     sensor_delay, input_delay = (
@@ -137,15 +137,15 @@ def simulate(
     )
     loop = Loop(
         estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
-        w=_disturbances(w, estimator.model), end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
+        w=_make_disturbances(w, estimator.model), end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
         sensor_delay=sensor_delay, now=now,
     )  # fmt: skip
-    surroundings = _disturbances(w, estimator.model)
+    surroundings = _make_disturbances(w, estimator.model)
     ocp, model, periods = loop.ocp, loop.model, round(duration / dt)
     plant, faults = install(plant, faults)
     outputs, inputs = (tuple(s.name for s in signals) for signals in (model.outputs, model.inputs))
     check_channels(faults, outputs, inputs)
-    cost = _checked_cost(ocp, ocp if stage_cost is None else stage_cost)
+    cost = _check_cost(ocp, ocp if stage_cost is None else stage_cost)
     # the loop's preview begins when its input will act, but the cost needs the present reference
     standing = loop.standing
     acting = Previews(reference, weight, ocp, dt, periods * dt, standing) if input_delay else None
@@ -187,15 +187,15 @@ def simulate(
         if on_step is not None:
             on_step(step)
         machine.advance(t, now_w if model.n_w else None)
-    return _result(rows, dt, loop.switches)
+    return _build_result(rows, dt, loop.switches)
 
 
-def _listed(faults: object) -> Sequence[object]:
+def _list_items(faults: object) -> Sequence[object]:
     """The items of a list or tuple; otherwise the object itself as single item."""
     return faults if isinstance(faults, list | tuple) else (faults,)
 
 
-def _disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview | None:
+def _make_disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview | None:
     """Measured disturbances as a function of time; None if the model has none.
 
     Raises:
@@ -239,7 +239,7 @@ def _in_time(late: Callable[[float], bool], t: float) -> bool:
     return not late(t)
 
 
-def _result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> ClosedLoopResult:
+def _build_result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> ClosedLoopResult:
     readings = [row.reading for row in rows]
     timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
     return ClosedLoopResult(
@@ -313,7 +313,7 @@ def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, fl
     )
 
 
-def _checked_cost(ocp: OCP, cost: OCP) -> OCP:
+def _check_cost(ocp: OCP, cost: OCP) -> OCP:
     if (cost.n_x, cost.n_u) != (ocp.n_x, ocp.n_u):
         raise InputError(
             f"stage_cost: it has {cost.n_x} states and {cost.n_u} inputs, but the controller has {ocp.n_x} and "
@@ -464,7 +464,7 @@ class ClosedLoopResult:
             values = getattr(self, name)
             if not values.size or (name == "y_ref" and not self.tracks_outputs):
                 continue
-            labels = _labels(name, values.shape[1], model)
+            labels = _label_columns(name, values.shape[1], model)
             columns.update({label: values[:, i] for i, label in enumerate(labels)})
         for name in ("source", "status", "stage_cost", "violation", "share", "alarm"):
             unit = "" if model is None or name not in UNITS else f" [{UNITS[name]}]"
@@ -476,7 +476,7 @@ class ClosedLoopResult:
         return pd.DataFrame(columns)
 
 
-def _labels(name: str, n: int, model: HybridModel | None) -> list[str]:
+def _label_columns(name: str, n: int, model: HybridModel | None) -> list[str]:
     if model is None or name == "h":
         return [f"{name}_{i}" for i in range(n)]
     if name == "d" and model.disturbance_model is not None:

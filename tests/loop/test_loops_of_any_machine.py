@@ -158,7 +158,7 @@ def test_a_loop_by_hand_is_the_simulated_one_and_lost_samples_of_the_inflow_are_
     assert ahead[0] == pytest.approx(ahead[1], rel=1e-9)
     with pytest.raises(InputError, match="measured disturbances"):
         loop().start([0.3], [1e-5, 1e-5])
-    with pytest.raises(InputError, match="the model has none"):
+    with pytest.raises(InputError, match="HM-LOOP-032"):
         Loop(observer(thermal(), None), CondensedController(thermal(), HEATERS), w=inflow)
 
 

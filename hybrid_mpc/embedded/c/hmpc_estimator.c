@@ -1,4 +1,4 @@
-/* Kalman filters over state, hidden state and unmeasured disturbances, side by side, and how probable each is.
+/* Kalman filters of state, hidden state and unmeasured disturbances, one for each mode, with the modes' probabilities.
 
    Source: Simon, Optimal State Estimation, 2006, section 13.2; Blom and Bar-Shalom, IEEE T-AC 33 (1988). */
 #include "hmpc_math.h"
@@ -8,10 +8,10 @@
 #if HMPC_MODES > 0
 
 enum {
-  START_LIMIT = 25, /* most periods at rest that the first estimate runs the hidden state through */
+  START_LIMIT = 25, /* maximum periods at rest that the first estimate simulates for the hidden state */
   START_ROUNDS = 20,
-  START_HALVINGS = 60, /* of a step that does not help */
-  START_SWEEPS = 30    /* of Jacobi's rotations */
+  START_HALVINGS = 60, /* of a step that does not reduce the error */
+  START_SWEEPS = 30    /* of Jacobi rotations */
 };
 
 static void known_w(hmpc_state *s, const real *w) {
@@ -30,7 +30,7 @@ static int any_finite(const real *y) {
   return any;
 }
 
-/* Outputs of an estimate, and how they answer to it. */
+/* Outputs of an estimate and their derivatives by it. */
 static void measured(const real *z, const real *u, const real *w, real *y, real (*slope)[HMPC_NE]) {
   real v[HMPC_NU];
   for (int i = 0; i < HMPC_NU; ++i) {
@@ -59,7 +59,7 @@ static void measured(const real *z, const real *u, const real *w, real *y, real 
     for (int j = 0; j < HMPC_ND; ++j) y[i] += disturbs_y[i][j] * z[HMPC_NZ + j];
 }
 
-/* One Gaussian with mean and covariance of a mixture. */
+/* Gaussian with the mean and covariance of a mixture. */
 static void mix(const hmpc_filter *filters, const real *share, hmpc_filter *to) {
   memset(to, 0, sizeof *to);
   for (int m = 0; m < HMPC_MODES; ++m) hmpc_add(to->z, share[m], filters[m].z, HMPC_NE);
@@ -82,8 +82,8 @@ static void together(hmpc_state *s, const real *share) {
   if (HMPC_ND > 0) memcpy(s->d, z + HMPC_NZ, sizeof s->d);
 }
 
-/* The step x that leaves the least of rows x - error, the shortest of these: rows made orthogonal by rotations, which
-   turn the errors too; what is left of dependent ones is rounding. */
+/* Least-squares step x of rows x = error with the smallest norm. Rotations make the rows orthogonal and also rotate the
+   errors; dependent rows shrink to rounding errors. */
 static void start_step(real (*rows)[HMPC_NX], real *error, real *x) {
   real largest = R(0.0);
   for (int sweep = 0; sweep < START_SWEEPS; ++sweep) {
@@ -116,8 +116,8 @@ static void start_step(real (*rows)[HMPC_NX], real *error, real *x) {
   }
 }
 
-/* Errors of the outputs at x in deviations of the sensors, and the outputs' slopes there, in these over what 1 means of
-   the states; returned is the sum of the errors' squares. */
+/* Errors of the outputs at x in standard deviations of the sensors, and their derivatives by the states in units of
+   start_size. Returns the sum of the squared errors. */
 static real start_lacks(const real *x, const real *y, const real *w, int mode, real *error, real (*rows)[HMPC_NX]) {
   real y_hat[HMPC_NY], sum = R(0.0);
 #if HMPC_CURVED
@@ -137,8 +137,8 @@ static real start_lacks(const real *x, const real *y, const real *w, int mode, r
   return sum;
 }
 
-/* x moved to where the outputs are y, by Newton's method; whole = 0: a step had to be shortened. Returned is what lacks.
-   One step if the outputs are linear in the state. */
+/* Moves x to a state with the outputs y by Newton's method; whole = 0: a step was shortened. Returns the remaining sum
+   of squared errors. One step suffices if the outputs are linear in the state. */
 static real start_newton(real *x, const real *y, const real *w, int mode, int *whole) {
   real error[HMPC_NY], rows[HMPC_NY][HMPC_NX], after[HMPC_NY], there[HMPC_NY][HMPC_NX], step[HMPC_NX], moved[HMPC_NX];
   real size = start_lacks(x, y, w, mode, error, rows), share = R(1.0), less = R(0.0);
@@ -154,7 +154,7 @@ static real start_newton(real *x, const real *y, const real *w, int mode, int *w
       for (int k = 0; k < HMPC_NX; ++k) moved[k] = x[k] + start_size[mode][k] * step[k] * share;
       less = start_lacks(moved, y, w, mode, after, there);
       if (less < size) break;
-      if (size < HMPC_START_FITS) return size; /* what is left is rounding */
+      if (size < HMPC_START_FITS) return size; /* only rounding errors remain */
       *whole = 0;
     }
     if (halving == START_HALVINGS) break;
@@ -166,8 +166,8 @@ static real start_newton(real *x, const real *y, const real *w, int mode, int *w
   return hmpc_finite(size) ? size : HMPC_HUGE;
 }
 
-/* The state nearest to the operating point's whose outputs are y where these are finite; where no step straight from
-   there gets to one, sought from one deviation beside it too. */
+/* The state closest to the operating point with the finite outputs of y. If Newton's method from the operating point
+   fails or shortens a step, it also starts one standard deviation from the operating point in each state. */
 static void start_fitting(const real *y, const real *w, int mode, real *x) {
   enum { TRIED = 2 * HMPC_NX + 1 };
   real found[TRIED][HMPC_NX], size[TRIED], least = HMPC_HUGE, nearest = R(INFINITY);
@@ -199,7 +199,7 @@ static void start_fitting(const real *y, const real *w, int mode, real *x) {
   }
 }
 
-/* (x, h, d) at rest: the state that fits the outputs, the hidden state run to rest there. */
+/* (x, h, d) at rest: the state that fits the outputs, and the hidden state after a simulation at rest. */
 static void start_at(const hmpc_state *s, const real *y, int mode, real *z) {
   real z_next[HMPC_LZ] = {R(0.0)};
   memset(z, 0, sizeof(real) * HMPC_LE);
@@ -216,13 +216,13 @@ static void start_at(const hmpc_state *s, const real *y, int mode, real *z) {
   }
 }
 
-/* Estimate at rest: the state nearest to the operating point's with these outputs. */
+/* Estimate at rest: the state closest to the operating point with these outputs. */
 void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
   real z[HMPC_LE];
   known_w(s, w);
   for (int m = 0; m < HMPC_MODES; ++m) {
     hmpc_filter *const f = &s->filter[m];
-    if (m < HMPC_START_MODES) start_at(s, y, m, z); /* the others begin alike */
+    if (m < HMPC_START_MODES) start_at(s, y, m, z); /* the other modes start equally */
     memset(f, 0, sizeof *f);
     memcpy(f->z, z, sizeof f->z);
     for (int i = 0; i < HMPC_NE; ++i) f->p[i][i] = first_variance[m][i];
@@ -231,7 +231,7 @@ void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
   together(s, s->probability);
 }
 
-/* One period on with the input held. */
+/* Prediction over one period with the input held. */
 static void predict(hmpc_state *s, const hmpc_filter *from, const real *u, int mode, hmpc_filter *to) {
   real v[HMPC_NU], next[HMPC_LZ] = {R(0.0)};
   const real *const d = from->z + HMPC_NZ;
@@ -264,7 +264,7 @@ static void predict(hmpc_state *s, const hmpc_filter *from, const real *u, int m
   }
 }
 
-/* After the sample, in Joseph form; what is not finite is left out. */
+/* Correction by the sample in Joseph form; non-finite outputs are left out. */
 static void correct(hmpc_state *s, hmpc_filter *f, const real *y, const real *u, int mode) {
   real y_hat[HMPC_NY], slope[HMPC_NY][HMPC_NE], step[HMPC_NE] = {R(0.0)}, size = R(0.0);
   const real *const noise_of = noise_y[mode];
@@ -351,7 +351,7 @@ void hmpc_estimate_update(hmpc_state *s, const real *y, const real *u_prev, cons
     weight[j] = hmpc_finite(likelihood) ? after[j] * hmpc_exp(likelihood - largest) : R(0.0);
     sum += weight[j];
   }
-  if (!(sum > R(0.0))) { /* absurd to every filter: it says nothing of the modes */
+  if (!(sum > R(0.0))) { /* implausible for every filter: no information on the modes */
     memcpy(weight, after, sizeof weight);
     sum = R(0.0);
     for (int j = 0; j < HMPC_MODES; ++j) sum += weight[j];

@@ -1,5 +1,5 @@
-/* A period of the loop: estimate, decide; then the monitor, the guard's next mode, and what of the next solve needs no
-   sample. */
+/* A period of the loop: estimate and decide; then the monitor, the guard's next mode, and the part of the next solve
+   that needs no sample. */
 #include "hmpc_math.h"
 #include "hmpc_tables.h"
 
@@ -8,7 +8,7 @@
 #if HMPC_GUARD
 enum { LONG_AGO = 1000000000 };
 
-/* Periods and more of them, as far as anybody counts. */
+/* periods + more, at most LONG_AGO. */
 static int later(int periods, int more) { return periods < LONG_AGO - more ? periods + more : LONG_AGO; }
 
 static void guard_begin(hmpc_state *s) {
@@ -18,7 +18,7 @@ static void guard_begin(hmpc_state *s) {
   g->since_frozen = LONG_AGO;
 }
 
-/* The mode of the next period, by what the monitor has just said. */
+/* Mode of the next period, from the monitor's reading. */
 static void guard_watched(hmpc_state *s) {
   hmpc_guard *const g = &s->guard;
   const hmpc_monitor *const m = &s->monitor;
@@ -41,7 +41,7 @@ static void guard_watched(hmpc_state *s) {
   if (g->wanted < g->mode && g->since < HMPC_DWELL) g->wanted = g->mode;
 }
 
-/* A new period: the mode that was wanted begins. */
+/* New period: the wanted mode begins. */
 static void guard_measured(hmpc_guard *g) {
   g->since = later(g->since, 1);
   g->since_alarm = later(g->since_alarm, 1);
@@ -92,7 +92,7 @@ static hmpb_goal backup_goal(const hmpc_goal *goal) {
 }
 #endif
 
-/* The input by the mode's controller; who has not made the last plan takes it over. */
+/* Input of the mode's controller; a controller that did not compute the last plan takes it over. */
 static void guard_decide(hmpc_state *s, const hmpc_goal *given, const real *held) {
   hmpc_guard *const g = &s->guard;
   real low[HMPC_NU], high[HMPC_NU];
@@ -129,7 +129,7 @@ static void guard_decide(hmpc_state *s, const hmpc_goal *given, const real *held
 }
 #endif
 
-/* What the monitor and the guard make of the period, once. */
+/* The monitor's reading and the guard's next mode, once for each period. */
 static void watched(hmpc_state *s) {
 #if HMPC_MONITOR
   if (s->watched) return;

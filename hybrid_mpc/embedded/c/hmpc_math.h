@@ -1,9 +1,9 @@
-/* Elementary functions of the controller: the same bits on every processor with IEEE arithmetic, as long as the
-   compiler contracts no multiply-add (-ffp-contract=off). Source of the coefficients: Moshier, Cephes. */
+/* Elementary functions: identical results on every processor with IEEE arithmetic if the compiler contracts no
+   multiply-add (-ffp-contract=off). Source of the coefficients: Moshier, Cephes. */
 #ifndef HMPC_MATH_H
 #define HMPC_MATH_H
 
-#include <math.h> /* fabs, sqrt, isfinite; what a prior needs beside the functions below */
+#include <math.h> /* fabs, sqrt, isfinite, and functions of a prior that are not below */
 #include <stdint.h>
 #include <string.h>
 #include "hmpc.h"
@@ -40,8 +40,8 @@ static inline real hmpc_same(real a, real b) { return a <= b && a >= b ? R(1.0) 
 static inline real hmpc_if(real condition, real x) { return condition < R(0.0) || condition > R(0.0) ? x : R(0.0); }
 static inline real hmpc_sign(real x) { return x > R(0.0) ? R(1.0) : x < R(0.0) ? R(-1.0) : x; }
 
-/* tanh without a branch, so that loops of it become vector code: a quotient p / q of x / 32, doubled five times by
-   tanh 2a = 2 p q / (p p + q q). */
+/* tanh without a branch, so that loops become vector code: a quotient p / q at x / 32, whose argument is doubled five
+   times by tanh 2a = 2 p q / (p p + q q). */
 static inline real hmpc_tanh(real x) {
   const real most = HMPC_TANH_MOST, y = (x > most ? most : x < -most ? -most : x) * R(0.03125), s = y * y;
   real q = ((s * R(0.00020643827072581487) + R(0.023288647825489308)) * s + R(0.46149035758330637)) * s + R(1.0);
@@ -55,7 +55,7 @@ static inline real hmpc_tanh(real x) {
   return p / q;
 }
 
-static inline real hmpc_power_of_two(int k) { /* k within the exponents of normal numbers */
+static inline real hmpc_power_of_two(int k) { /* k: an exponent of normal numbers */
 #ifdef HMPC_FLOAT
   const uint32_t bits = (uint32_t)(k + 127) << 23;
 #else
@@ -90,7 +90,7 @@ static inline real hmpc_log(real x) {
   return R(k) * R(1.42860682030941723212e-6) + (R(2.0) * t * (R(1.0) + sum) + R(k) * R(6.93145751953125e-1));
 }
 
-/* Sine where quarter is 0, cosine where it is 2; NaN for angles whose period nobody can tell any more. */
+/* Sine for quarter = 0, cosine for quarter = 2; NaN for angles too large to be reduced to a period. */
 static inline real hmpc_turned(real x, int quarter) {
   const real size = hmpc_abs(x);
   if (!(size <= HMPC_ANGLE_MOST)) return R(NAN);
@@ -115,7 +115,7 @@ static inline real hmpc_turned(real x, int quarter) {
 static inline real hmpc_sin(real x) { return hmpc_turned(x, 0); }
 static inline real hmpc_cos(real x) { return hmpc_turned(x, 2); }
 
-/* Sum of products in eight partial sums, so that it becomes vector code and its order is the same everywhere. */
+/* Sum of products in eight partial sums: vector code with the same order of additions on every processor. */
 static inline real hmpc_dot(const real *a, const real *b, int n) {
   real part[8] = {R(0.0)}, rest = R(0.0);
   const int whole = n / 8 * 8;
@@ -129,13 +129,13 @@ static inline void hmpc_add(real *to, real factor, const real *from, int n) {
   for (int i = 0; i < n; ++i) to[i] += factor * from[i];
 }
 
-/* Layers of a network: y = weight x, where rows of weight have n entries. */
+/* Layer of a network: y = weight x; rows of weight have n entries. */
 static inline void hmpc_layer(const real *weight, int rows, int n, const real *x, real *y) {
   for (int i = 0; i < rows; ++i) y[i] = hmpc_dot(weight + i * n, x, n);
 }
 
-/* Derivatives of y, rows of width: weight times those of x, of which a few are looked at one by one and rows that are
-   full are taken whole. */
+/* Derivatives of y (rows of length width): weight times the derivatives of x. Of these, the nonzero entries (few,
+   column) are multiplied singly, and the full rows as a whole. */
 static inline void hmpc_layer_slope(const real *weight, int rows, int n, const real *by, int width, const int *few,
                                     const int *column, int fews, const int *full, int fulls, real *to) {
   for (int i = 0; i < rows; ++i) {
@@ -146,8 +146,8 @@ static inline void hmpc_layer_slope(const real *weight, int rows, int n, const r
   }
 }
 
-/* Adds to rows at of others what reaches them through products from: factors times these products' derivatives, whose
-   columns are columns onto there. */
+/* Adds factor[e] times the derivatives of product from[e] to row at[e]; column c of a product is column onto[c] of the
+   row. */
 static inline void hmpc_layer_pass(const int *at, const int *from, const real *factor, int count, const real *through,
                                    int width, const int *onto, int n, real *to, int stride) {
   for (int e = 0; e < count; ++e) {
@@ -157,10 +157,11 @@ static inline void hmpc_layer_pass(const int *at, const int *from, const real *f
   }
 }
 
-enum { HMPC_ROWS = 2, HMPC_COLUMNS = 8 }; /* of the block of a product that stays in registers */
+enum { HMPC_ROWS = 2, HMPC_COLUMNS = 8 }; /* size of the block of a product that stays in registers */
 
-/* c = a b for the first columns, rounded up to eight; rows of a are length apart, those of b and c stride. All but
-   columns are constants where it is called, so that it becomes vector code there. */
+/* c = a b for the first columns, whose number is rounded up to a multiple of eight. Rows of a have length entries, rows
+   of b and c have stride entries. Callers pass constants for all sizes except columns, so that it becomes vector
+   code. */
 static inline void hmpc_multiply(const real *restrict a, int length, const real *restrict b, real *restrict c, int rows,
                                  int inner, int columns, int stride) {
   for (int j = 0; j < columns; j += HMPC_COLUMNS) {
@@ -179,7 +180,7 @@ static inline void hmpc_multiply(const real *restrict a, int length, const real 
       for (int p = 0; p < HMPC_ROWS; ++p)
         for (int q = 0; q < HMPC_COLUMNS; ++q) c[(i + p) * stride + j + q] = sum[p][q];
     }
-    if (rows % HMPC_ROWS) { /* the last of an odd number */
+    if (rows % HMPC_ROWS) { /* last row of an odd number */
       real sum[HMPC_COLUMNS];
       for (int q = 0; q < HMPC_COLUMNS; ++q) sum[q] = R(0.0);
       for (int l = 0; l < inner; ++l) {

@@ -1,5 +1,5 @@
-/* A period of the model and its Jacobian: scalar code of the prior around a GRU, whose Jacobian is constant matrices
-   with scaled rows. */
+/* One period of the model and its Jacobian: scalar code of the prior, and a GRU, whose Jacobian consists of constant
+   matrices with scaled rows. */
 #include "hmpc_math.h"
 #include "hmpc_expressions.h"
 
@@ -47,7 +47,7 @@ static void gru(const real *seen, const real *h, cell *c) {
 #endif
 
 #if HMPC_UNITS > 0
-/* What the scalar code sees of the new hidden state: a few linear combinations. */
+/* Linear combinations of the new hidden state that the scalar code uses. */
 static void reduce(const real *units, real *out) {
   for (int k = 0; k < HMPC_HEAD; ++k) out[k] = hmpc_dot(head[k], units, HMPC_UNITS);
 }

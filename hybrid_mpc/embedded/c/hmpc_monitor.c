@@ -1,6 +1,6 @@
-/* The monitor: channels compare the model with the machine, a detector compares each with its limits. Channels are
-   read either of the energy, for mechanical machines whose positions are measured, or of the residuals of outputs and
-   balances, for any machine. */
+/* The monitor: channels compare the model with the machine, and a detector compares each channel with its limits. The
+   channels are either the energy balance (mechanical machines with measured positions) or the residuals of outputs and
+   balances (any machine). */
 #include "hmpc_math.h"
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
@@ -9,7 +9,7 @@
 
 static int more_seen(int seen, int most) { return seen < most ? seen + 1 : most; }
 
-/* The estimate, for the next period. */
+/* Stores the estimate for the next period. */
 static void remember(const hmpc_state *s, real *z, real *w) {
   memset(z, 0, sizeof(real) * HMPC_LZ);
   memcpy(z, s->x, sizeof s->x);
@@ -30,7 +30,7 @@ static int all_equal(const real *a, const real *b, int n) {
 }
 
 #if HMPC_LIMITS > 0
-/* Mean of a channel's latest values that are numbers; NaN where fewer than half are. */
+/* Mean of the finite ones of a channel's last values; NaN if fewer than half are finite. */
 static real mean_of(const hmpc_monitor *m, int channel, int length) {
   real total = R(0.0);
   int count = 0, k = m->newest;
@@ -45,7 +45,7 @@ static real mean_of(const hmpc_monitor *m, int channel, int length) {
   return 2 * count >= length ? total / R(count > 0 ? count : 1) : R(NAN);
 }
 
-/* A value in its nominal deviations. */
+/* A value in nominal standard deviations. */
 static real scaled(const hmpc_monitor *m, int limit, real (*terms)[HMPC_DIM(HMPC_TERMS)]) {
   const int c = limit_channel[limit];
 #if HMPC_TERMS > 0
@@ -59,7 +59,7 @@ static real scaled(const hmpc_monitor *m, int limit, real (*terms)[HMPC_DIM(HMPC
 }
 #endif
 
-/* Levels of all limits, alarms, frozen sensors: what the values say; terms are those of their variances. */
+/* Levels of all limits, alarms and frozen sensors from the channels' values; terms: terms of their variances. */
 static void detect(hmpc_monitor *m, real (*terms)[HMPC_DIM(HMPC_TERMS)], int settled, const int *inside) {
   m->alarm = m->frozen = 0;
   m->share = R(NAN);
@@ -102,7 +102,7 @@ static void detect(hmpc_monitor *m, real (*terms)[HMPC_DIM(HMPC_TERMS)], int set
   }
 }
 
-/* Whether there has been no valid reading for too long; the last of a period. */
+/* Last step of a period: sets blind if there was no valid reading for too long. */
 static void judge(hmpc_monitor *m, hmpc_validity validity) {
   m->validity = validity;
   m->invalid = validity == HMPC_VALID ? 0 : more_seen(m->invalid, HMPC_BLIND_AFTER + 1);
@@ -133,12 +133,12 @@ void hmpc_watch_begin(hmpc_state *s) {
   }
 }
 
-/* What the model says of slow motion at z's position: its mean acceleration there, and by how much dry friction and
-   damping slow it; jump is what dry friction can hold at rest. */
+/* Accelerations of the model in slow motion at the position of z: mean of both directions, deceleration by dry friction
+   and damping (slowed), and the acceleration that dry friction can hold at rest (jump). */
 static void near_rest(const real *z, const real *u, const real *w, real *mean, real *slowed, real *jump) {
   real at[HMPC_LZ], rate[4][HMPC_NX];
   memcpy(at, z, sizeof at);
-  for (int k = 0; k < 4; ++k) { /* back, forth, and twice as fast */
+  for (int k = 0; k < 4; ++k) { /* both directions, at the rest speed and at twice the rest speed */
     for (int i = 0; i < NQ; ++i)
       at[NQ + i] = (k % 2 ? R(1.0) : R(-1.0)) * (k < 2 ? rest_speed[i] : R(2.0) * rest_speed[i]);
     hmpc_rates(at, u, w, rate[k]);
@@ -150,7 +150,7 @@ static void near_rest(const real *z, const real *u, const real *w, real *mean, r
   }
 }
 
-/* Force that the model does not explain; near rest, what dry friction could not hold either. */
+/* Force that the model does not explain; near rest, reduced by the force that dry friction can hold. */
 static void residual_force(const real *z, const real *u, const real *w, const real *measured, const real *model,
                            real *force) {
   real error[HMPC_NQ], off[HMPC_NQ], slowest = R(INFINITY);
@@ -176,11 +176,11 @@ static void residual_force(const real *z, const real *u, const real *w, const re
   }
 }
 
-/* Speed and travel that the input should have caused since the sensors' last step. */
+/* Speed and travel that the input should have caused since the measured positions last changed. */
 static void push(hmpc_monitor *m, int still, const real *u) {
   const real *acting = u;
   int known = still, strong = 0;
-  if (HMPC_DELAYED > 0) acting = m->z + HMPC_NX; /* the oldest input on its way is the one that has begun to act */
+  if (HMPC_DELAYED > 0) acting = m->z + HMPC_NX; /* the oldest delayed input acts now */
   for (int i = 0; i < HMPC_NU; ++i) known &= hmpc_abs(m->before[i]) < R(INFINITY);
   if (!known) memcpy(m->before, acting, sizeof m->before);
   for (int i = 0; i < HMPC_NU; ++i)
@@ -219,7 +219,7 @@ static void polynomial(const real (*q)[HMPC_NQ], const real *newest, real *posit
   }
 }
 
-/* The energy balance at position and speed, if the speed changes at that acceleration. */
+/* Energy balance at a position, speed and acceleration. */
 static real balance(const real *state, const real *acceleration, const real *given) {
   real rate[HMPC_NX], value;
   for (int i = 0; i < NQ; ++i) {
@@ -231,7 +231,7 @@ static real balance(const real *state, const real *acceleration, const real *giv
 }
 
 #if HMPC_FREE_RUN > 0
-/* Free runs that have come to their end begin anew, at the estimate of a period ago. */
+/* Ended free runs start again at the estimate of the previous period. */
 static void begin_runs(hmpc_monitor *m) {
   for (int k = 0; k < 2; ++k) {
     hmpc_free_run *const run = &m->run[k];
@@ -243,11 +243,11 @@ static void begin_runs(hmpc_monitor *m) {
     memcpy(run->z, m->z, sizeof run->z);
     memcpy(run->q[HMPC_WINDOW - 1], m->z, sizeof run->q[0]);
     memset(run->sum, 0, sizeof run->sum);
-    run->left = hmpc_all_finite(m->z, HMPC_NX) ? HMPC_FREE_RUN : 1; /* else try again at the next sample */
+    run->left = hmpc_all_finite(m->z, HMPC_NX) ? HMPC_FREE_RUN : 1; /* otherwise it starts at the next sample */
   }
 }
 
-/* A free run one period on: what its balance departs from the measured one. */
+/* Free run over one period; adds the deviation of its energy balance from the measured one. */
 static void go_on(hmpc_free_run *run, const real *u, const real *w, const real *given, const real *speed,
                   real measured) {
   real next[HMPC_LZ] = {R(0.0)}, state[HMPC_NX] = {R(0.0)}, acceleration[HMPC_NQ] = {R(0.0)}, v2 = R(0.0), u2 = R(0.0);
@@ -256,7 +256,7 @@ static void go_on(hmpc_free_run *run, const real *u, const real *w, const real *
   memcpy(run->z, next, sizeof next);
   memmove(run->q, run->q + 1, sizeof run->q - sizeof run->q[0]);
   memcpy(run->q[HMPC_WINDOW - 1], next, sizeof run->q[0]);
-  if (run->left > HMPC_FREE_RUN - HMPC_WINDOW + 2) return; /* its window is not full */
+  if (run->left > HMPC_FREE_RUN - HMPC_WINDOW + 2) return; /* its window is not yet full */
   polynomial((const real(*)[HMPC_NQ])run->q, none, state, state + NQ, acceleration);
   for (int i = 0; i < NQ; ++i) v2 += speed[i] * speed[i];
   for (int i = 0; i < HMPC_NU; ++i) u2 += given[i] * given[i];
@@ -270,7 +270,7 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   hmpc_monitor *const m = &s->monitor;
   real next[HMPC_LZ] = {R(0.0)}, *row = m->row[HMPC_WINDOW - 2];
   const real *const before = m->y[HMPC_WINDOW - 1];
-  /* one step from the estimate of a period ago */
+  /* prediction from the estimate of the previous period */
   hmpc_model(m->z, u_prev, m->w, next);
   const int still = all_equal(y, before, HMPC_NQ);
   for (int i = 0; i < NQ; ++i) {
@@ -288,7 +288,7 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   if (HMPC_NW > 0) memcpy(row + AT_GIVEN + HMPC_NU, m->w, sizeof m->w);
   memmove(m->y, m->y + 1, sizeof m->y - sizeof m->y[0]);
   memcpy(m->y[HMPC_WINDOW - 1], y, sizeof m->y[0]);
-  /* the window's centre */
+  /* values at the centre of the window */
   real at[HMPC_LZ], measured[HMPC_NQ], model[HMPC_NQ] = {R(0.0)}, given[HMPC_DIM(GIVEN)] = {R(0.0)};
   memcpy(at, m->z, sizeof at);
   polynomial((const real(*)[HMPC_NQ])m->y, y, at, at + NQ, measured);
@@ -324,7 +324,7 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   begin_runs(m);
   for (int k = 0; k < 2; ++k) go_on(&m->run[k], u_prev, m->w, given, at + NQ, measured_balance);
   int which = m->run[0].left <= m->run[1].left ? 0 : 1;
-  if (!is_number(m->run[which].sum[0])) which = 1 - which; /* NaN: not begun yet */
+  if (!is_number(m->run[which].sum[0])) which = 1 - which; /* NaN: not started */
   const real *const older = m->run[which].sum;
   const real time = R(HMPC_FREE_RUN - HMPC_WINDOW + 3 - m->run[which].left) * HMPC_DT;
   m->value[1 + NQ] = R(NAN);
@@ -338,7 +338,7 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   }
 #endif
   detect(m, terms, 1, inside);
-  /* whether this is a reading */
+  /* validity of the reading */
   const int missing =
       !hmpc_all_finite(y, HMPC_NY) || (m->seen > 0 && !hmpc_all_finite(u_prev, HMPC_NU));
   m->seen = more_seen(m->seen, HMPC_WINDOW);
@@ -370,7 +370,7 @@ void hmpc_watch_begin(hmpc_state *s) {
   }
 }
 
-/* A free run one period on, and what was measured less its outputs. */
+/* Free run over one period, and the measured outputs minus its outputs. */
 static void go_on(const hmpc_monitor *m, const real *u, const real *y, int k, real *next, real *error) {
   real acting[HMPC_NU];
   const real *const d = m->run_d[k];
@@ -389,11 +389,11 @@ static void go_on(const hmpc_monitor *m, const real *u, const real *y, int k, re
   }
 }
 
-/* Error of the older free run; those that are at their end, or lost, begin anew at the estimate. */
+/* Error of the older free run. Free runs that ended or diverged start again at the estimate. */
 static void run_free(hmpc_state *s, const real *u, const real *y, real *error) {
   hmpc_monitor *const m = &s->monitor;
   real next[HMPC_LZ], own[HMPC_NY];
-  const int first = m->age[0] >= m->age[1] ? 0 : 1; /* the older */
+  const int first = m->age[0] >= m->age[1] ? 0 : 1; /* the older free run */
   forget(error, HMPC_NY);
   for (int k = 0; k < 2; ++k) {
     go_on(m, u, y, k, next, own);
@@ -417,7 +417,7 @@ static void run_free(hmpc_state *s, const real *u, const real *y, real *error) {
 void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
   hmpc_monitor *const m = &s->monitor;
   real next[HMPC_LZ] = {R(0.0)}, predicted[HMPC_NY], last[HMPC_NY], rate[HMPC_NX], moved[HMPC_NY];
-  /* one step from the estimate of a period ago */
+  /* prediction from the estimate of the previous period */
   hmpc_model(m->z, u_prev, m->w, next);
   outputs(next, u_prev, m->w, predicted);
   outputs(m->z, u_prev, m->w, last);
@@ -445,7 +445,7 @@ void hmpc_watch(hmpc_state *s, const real *y, const real *u_prev) {
     inside[i] = y[i] > sensor_end[0][i] && y[i] < sensor_end[1][i];
   }
   detect(m, (real(*)[HMPC_DIM(HMPC_TERMS)])0, settled, inside);
-  /* whether this is a reading */
+  /* validity of the reading */
   const int missing = !(hmpc_all_finite(y, HMPC_NY) && hmpc_all_finite(u_prev, HMPC_NU));
   judge(m, hmpc_all_finite(m->value, FIRST_FREE) ? HMPC_VALID
            : m->seen < 2                         ? HMPC_WARM_UP

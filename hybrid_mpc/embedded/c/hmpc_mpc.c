@@ -1,12 +1,12 @@
-/* The real-time iteration: shift, linearize and condense; then embed the estimate, solve the QP, check it; and the
-   safeguards, so that there is an input in every period. */
+/* Real-time iteration. Preparation: shift, linearize and condense. Feedback: embed the estimate, solve the QP and check
+   the solution. Safeguards: an input in every period. */
 #include "hmpc_math.h"
 #include "hmpc_tables.h"
 #include "hmpc_expressions.h"
 
-enum { COST_SWEEPS = 30 }; /* of Jacobi's rotations */
+enum { COST_SWEEPS = 30 }; /* of Jacobi rotations */
 
-/* What acts: inputs with what the unmeasured disturbances add to them. */
+/* Acting inputs: the inputs plus their unmeasured disturbances. */
 static void acting(const real *u, const real *d, real *v) {
   for (int i = 0; i < HMPC_NU; ++i) {
     v[i] = u[i];
@@ -81,13 +81,13 @@ static void condense(hmpc_state *s) {
   }
 }
 
-/* hessian += factor a b', where b are combinations of rows like a, so that the sum of all is symmetric */
+/* lower triangle of hessian += factor a b'; the sum over all calls is symmetric */
 static void add_product(real (*hessian)[HMPC_LD], real factor, const real *a, const real *b, int n) {
   for (int i = 0; i < n; ++i) hmpc_add(hessian[i], factor * a[i], b, i + 1);
 }
 
 #if HMPC_OUTPUT_ROWS
-/* Derivative of an output of period k by the unknowns; returned is how many of them it depends on. */
+/* Derivative of an output of period k by the unknowns. Returns the number of unknowns it depends on. */
 static int output_row(const hmpc_linear *linear, int k, int i, real *row) {
   const int first = block_of[k] * HMPC_NU;
   memset(row, 0, sizeof(real) * HMPC_LD);
@@ -96,7 +96,7 @@ static int output_row(const hmpc_linear *linear, int k, int i, real *row) {
   return first + HMPC_NU;
 }
 
-/* Outputs of period k without a step, less their reference. */
+/* Outputs of period k before the step, minus their reference. */
 static void output_error(const hmpc_state *s, int k, real *error) {
   real x[HMPC_NX], v[HMPC_NU];
   for (int i = 0; i < HMPC_NX; ++i) x[i] = s->linear.z[k][i] + s->dz[k][i];
@@ -110,8 +110,7 @@ static void output_error(const hmpc_state *s, int k, real *error) {
 #endif
 
 #if HMPC_STAGE_COST
-/* What the costs that are no squares of states and inputs depend on in period k, besides them: parameters, and where
-   outputs are weighed their references. */
+/* Parameters of the general stage cost in period k; cost_y: references of the outputs if outputs are weighted. */
 static const real *cost_p(const hmpc_goal *goal, int k) {
   static const real none[HMPC_DIM(HMPC_NP)];
   return HMPC_NP > 0 && goal && goal->p ? goal->p + (k < goal->rows ? k : goal->rows - 1) * HMPC_NP : none;
@@ -127,7 +126,7 @@ static const real *cost_y(const hmpc_state *s, int k) {
 #endif
 }
 
-/* Eigenvalues of a symmetric matrix, which become its diagonal, and eigenvectors, the rows of v, by Jacobi's rotations.
+/* Eigenvalues (diagonal of a on return) and eigenvectors (rows of v) of a symmetric matrix by Jacobi rotations.
    Source: Golub and Van Loan, Matrix Computations, 2013, section 8.5. */
 static void eigen(real (*a)[HMPC_NC], real (*v)[HMPC_NC]) {
   for (int i = 0; i < HMPC_NC; ++i)
@@ -137,7 +136,7 @@ static void eigen(real (*a)[HMPC_NC], real (*v)[HMPC_NC]) {
     for (int i = 0; i < HMPC_NC; ++i)
       for (int j = i + 1; j < HMPC_NC; ++j) {
         const real off = a[i][j];
-        /* it changes no digit of either */
+        /* negligible relative to both diagonal entries */
         if (!(hmpc_abs(off) > HMPC_TARGET_ROUNDING * R(0.1) * (hmpc_abs(a[i][i]) + hmpc_abs(a[j][j])))) continue;
         const real ratio = (a[j][j] - a[i][i]) / (R(2.0) * off);
         const real size = R(1.0) / (hmpc_abs(ratio) + hmpc_sqrt(R(1.0) + ratio * ratio));
@@ -161,8 +160,8 @@ static void eigen(real (*a)[HMPC_NC], real (*v)[HMPC_NC]) {
   }
 }
 
-/* Derivatives of these costs along the plan; what curves down counts as flat, directions counted in the sizes of states
-   and inputs. */
+/* Derivatives of the general stage cost along the plan. Negative eigenvalues of its curvature, scaled by the sizes of
+   states and inputs, are set to zero. */
 static void make_costs(hmpc_state *s, const hmpc_goal *goal) {
   hmpc_linear *const linear = &s->linear;
   for (int k = 0; k < HMPC_N; ++k) {
@@ -171,7 +170,7 @@ static void make_costs(hmpc_state *s, const hmpc_goal *goal) {
                       linear->cost_slope[k], curve[0]);
     for (int i = 0; i < HMPC_NC; ++i)
       for (int j = 0; j < HMPC_NC; ++j) a[i][j] = curve[i > j ? i : j][i > j ? j : i] * cost_size[i] * cost_size[j];
-    if (!hmpc_all_finite(a[0], HMPC_NC * HMPC_NC)) continue; /* neither is what is made of it */
+    if (!hmpc_all_finite(a[0], HMPC_NC * HMPC_NC)) continue; /* the QP's numbers are not finite either */
     eigen(a, v);
     memset(curve, 0, sizeof linear->cost_curve[k]);
     for (int e = 0; e < HMPC_NC; ++e)
@@ -180,7 +179,7 @@ static void make_costs(hmpc_state *s, const hmpc_goal *goal) {
   }
 }
 
-/* Derivatives of state and input of period k by the unknowns; returned is how many of them these are. */
+/* Derivatives of state and input of period k by the unknowns. Returns the number of unknowns they depend on. */
 static int stage_rows(const hmpc_linear *linear, int k, real (*rows)[HMPC_LD]) {
   const int first = block_of[k] * HMPC_NU;
   memcpy(rows, linear->from_u[k], sizeof linear->from_u[k]);
@@ -253,7 +252,8 @@ static void make_hessian(hmpc_state *s) {
 }
 
 #if HMPC_SOFT > 0
-/* Soft and hard bounds along the plan; those of outputs depend on the disturbances, those that move on the goal. */
+/* Soft and hard bounds along the plan. Bounds of outputs depend on the disturbances d, bounds with parameters on the
+   goal. */
 static void make_soft(hmpc_state *s, const real *d, const hmpc_goal *goal) {
   hmpc_linear *const linear = &s->linear;
 #if HMPC_SOFT_E > 0
@@ -296,7 +296,7 @@ static void set_weights(hmpc_linear *linear, const hmpc_goal *goal) {
           terminal[i][j] * hmpc_sqrt(linear->weight[HMPC_N][i]) * hmpc_sqrt(linear->weight[HMPC_N][j]);
 }
 
-/* Jacobians along linear->u, z, d, w; with append, the last state is where the model goes. */
+/* Jacobians along linear->u, z, d, w; append: the last state is the model's prediction from the one before. */
 static void linearize(hmpc_state *s, int append) {
   hmpc_linear *const linear = &s->linear;
   real v[HMPC_NU], z_next[HMPC_LZ] = {R(0.0)};
@@ -349,7 +349,7 @@ void hmpc_prepare(hmpc_state *s, const hmpc_goal *goal) {
 
 /* ---- feedback */
 
-/* dz of all periods from dz[0], with what the disturbances' change and, with a step, the inputs add. */
+/* dz of all periods from dz[0], the change of the disturbances, and the step of the inputs (NULL: none). */
 static void propagate(hmpc_state *s, const real *step) {
   const hmpc_linear *const linear = &s->linear;
   real change[HMPC_DIM(HMPC_ND)], v[HMPC_NU];
@@ -378,8 +378,8 @@ static const real *row_of(const real *rows, int count, int k, int width) {
   return rows + (k < count ? k : count - 1) * width;
 }
 
-/* Limits of the inputs as those of the steps. Where the limit of the change keeps an input from being within tighter
-   limits at once, they go there as fast as it lets them. */
+/* Limits of the inputs as limits of the step. If the limit of the change prevents an input from reaching tighter limits
+   at once, the limits approach them as fast as that limit allows. */
 static void limits_of(const hmpc_goal *goal, const real *u_prev, int k, real *low, real *high) {
   for (int i = 0; i < HMPC_NU; ++i) {
     low[i] = u_min[i];
@@ -410,7 +410,7 @@ static void set_bounds(hmpc_state *s, const hmpc_goal *goal) {
       qp->upper[i] = (high[j] - u[j]) / u_scale[j];
       qp->change_lower[i] = (-du_max[j] - (u[j] - before[j])) / u_scale[j];
       qp->change_upper[i] = (du_max[j] - (u[j] - before[j])) / u_scale[j];
-      if (b == 0) { /* the first change is the first input */
+      if (b == 0) { /* the first change is the step of the first input */
         qp->lower[i] = hmpc_max(qp->lower[i], qp->change_lower[i]);
         qp->upper[i] = hmpc_min(qp->upper[i], qp->change_upper[i]);
         qp->change_lower[i] = -R(INFINITY);
@@ -439,12 +439,12 @@ static void set_soft(hmpc_state *s) {
 #endif
 }
 
-/* The input that a plan is drawn to: that of the set-point's steady state, or else the operating point's. */
+/* Reference of an input: that of the set-point's steady state, else the operating point's. */
 static real input_goal(const real *u_goal, int period, int input) {
   return u_goal ? u_goal[period * HMPC_NU + input] : u_rest[input];
 }
 
-/* Cost of the plan that qp.step makes of the prepared one, and the largest violations of soft and of hard bounds. */
+/* Cost of the prepared plan with the step qp.step, and its largest violations of soft and of hard bounds. */
 static void assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int rows, const real *u_goal) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
@@ -522,7 +522,7 @@ static void assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, in
   s->plan.excess = excess;
 }
 
-/* The prepared plan, where no solution may be applied. */
+/* Keeps the prepared plan if there is no valid solution. */
 static hmpc_status failed(hmpc_state *s, hmpc_status status) {
   const hmpc_linear *const linear = &s->linear;
   memcpy(s->plan.u, linear->u, sizeof s->plan.u);
@@ -537,7 +537,7 @@ static hmpc_status failed(hmpc_state *s, hmpc_status status) {
   return s->status = status;
 }
 
-/* What a plan is drawn to: states, the input (NULL: the operating point's), and how many rows of states there are. */
+/* References of a plan: states, inputs (NULL: the operating point's), and the number of rows of states. */
 typedef struct {
   const real *x, *u;
   int rows;
@@ -580,7 +580,7 @@ static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows
 #if HMPC_OUTPUT_COST
   hmpc_aim(s, goal);
 #endif
-#if HMPC_COST_MOVES /* with references and parameters */
+#if HMPC_COST_MOVES /* the cost depends on references and parameters */
   make_costs(s, goal);
   make_hessian(s);
 #endif
@@ -674,7 +674,7 @@ static void saturate(const hmpc_goal *goal, const real *u, const real *held, rea
   }
 }
 
-/* The stabilising feedback on the prior, around what holds the goal best; 0 if it is not finite. */
+/* Stabilising feedback of the prior around the steady state closest to the goal; 0 if it is not finite. */
 static int fallback(hmpc_state *s, const hmpc_goal *goal, real *u) {
 #if HMPC_FALLBACK_GAIN
   real best[HMPC_NU];
@@ -714,8 +714,8 @@ static int fallback(hmpc_state *s, const hmpc_goal *goal, real *u) {
 #endif
 }
 
-/* The input where no solution may be applied: of the plan, which is shifted already, if it may be followed, else of the
-   fallback, else the safe one; and the plan from there. */
+/* Input and plan without a valid solution: the input of the shifted plan if follow, else of the fallback, else the safe
+   input, or the held one if no safe input is declared. */
 static void without(hmpc_state *s, const hmpc_goal *goal, const real *held, int follow) {
   real u[HMPC_NU];
   const int known = hmpc_all_finite(s->x, HMPC_NX) && hmpc_all_finite(s->h, HMPC_NH) &&
@@ -784,7 +784,7 @@ void hmpc_rest(hmpc_state *s, const hmpc_goal *goal, const real *held) {
   s->age = 0;
 }
 
-/* One period earlier, with the held input in it: the preparation shifts it. */
+/* Delays the plan by one period, with the held input first; the preparation shifts it back. */
 static void delay_plan(hmpc_state *s, const real *held) {
   memmove(s->plan.z + 1, s->plan.z, sizeof s->plan.z - sizeof s->plan.z[0]);
   memmove(s->plan.u + 1, s->plan.u, sizeof s->plan.u - sizeof s->plan.u[0]);
@@ -816,7 +816,7 @@ void hmpc_take_over(hmpc_state *s, const real *plan, const real *held) {
   s->age = 0;
 }
 
-/* Iterations of a first plan, which has no predecessor, from the inputs u, the last row held; 0 if one failed. */
+/* Iterations of a first plan, which has no previous plan, from the inputs u with the last row held; 0 if one failed. */
 static int iterate(hmpc_state *s, const hmpc_goal *goal, const real *u, int rows) {
   s->working.count = 0;
   hmpc_run_free(s, u, rows);
@@ -829,7 +829,7 @@ static int iterate(hmpc_state *s, const hmpc_goal *goal, const real *u, int rows
 }
 
 #if HMPC_STARTS > 0
-/* Cost of the plan's inputs on a run of the model. */
+/* Cost of a free run of the model under the inputs u. */
 static real cost_of_run(hmpc_state *s, const hmpc_goal *goal, const real *u) {
   hmpc_linear *const linear = &s->linear;
   drawn_to to;
@@ -853,7 +853,7 @@ void hmpc_begin(hmpc_state *s, const real *applied, const hmpc_goal *goal) {
   s->source = HMPC_HELD;
   s->age = 0;
   int solved = iterate(s, goal, s->u, 1);
-#if HMPC_STARTS > 0 /* the cheapest plan of those from here and from elsewhere */
+#if HMPC_STARTS > 0 /* the plan with the lowest cost, from the held input and from further starts */
   real best[HMPC_N][HMPC_NU], inputs[HMPC_N][HMPC_NU], least = R(INFINITY);
   for (int n = 0; n <= HMPC_STARTS; ++n) {
     if (n > 0) solved = iterate(s, goal, starts[n > 0 ? n - 1 : 0], HMPC_N);

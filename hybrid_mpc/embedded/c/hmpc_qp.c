@@ -1,8 +1,8 @@
-/* Dense dual active-set solver for the condensed QP. The multipliers of the bounds in the working set move towards
-   those that keep these bounds exactly; who reaches zero leaves; the bound that is violated most comes in. A soft bound
-   is an exact penalty l s + r s s / 2 of its slack s: up to the multiplier l it acts as a hard one, beyond it gives
-   way. A hard bound has a penalty far above what it may cost to keep; where one gives way, the QP is solved once more
-   with those that never do, and that answer taken if there is one.
+/* Dense dual active-set solver for the condensed QP. The multipliers of the working set move towards the values that
+   keep its bounds exactly. A bound whose multiplier reaches zero leaves; the bound with the largest violation joins. A
+   soft bound has the exact penalty l s + r s s / 2 of its slack s: it acts as a hard bound up to the multiplier l, and
+   is relaxed beyond it. A hard bound has a very large penalty. If one is relaxed, the QP is solved again with hard
+   bounds that are never relaxed; that solution is used if it exists.
 
    Bounds, all as a's <= b, by number: upper and lower limits of the unknowns; upper and lower limits of their changes;
    upper and lower soft bounds.
@@ -21,7 +21,7 @@ enum {
   SOFT_STATES = HMPC_N * HMPC_SOFT_X
 };
 
-/* A soft row: by what its derivative is to be multiplied, and the derivative. */
+/* A soft row: its kind (index of its scale and limits) and its derivative. */
 static const real *soft_row(const hmpc_qp *qp, const hmpc_linear *linear, int row, int *kind) {
 #if HMPC_SOFT_X > 0
   if (row < SOFT_STATES) {
@@ -49,7 +49,7 @@ static int soft_kind(int row) {
   return row % HMPC_DIM(HMPC_SOFT_X);
 }
 
-/* Whether a row's bounds hold in its period: hard ones do from the first on that an input reaches. */
+/* Whether a row's bounds apply in its period: hard bounds apply from the first period that an input can affect. */
 static int holds(int row) {
 #if HMPC_SOFT_E > 0
   if (row >= SOFT_STATES) return (row - SOFT_STATES) / HMPC_SOFT_E >= soft_first[soft_kind(row)];
@@ -60,7 +60,7 @@ static int holds(int row) {
 
 static int soft_of(int id) { return id < SOFT_UPPER ? -1 : (id - SOFT_UPPER) % HMPC_DIM(HMPC_SOFT); }
 
-/* Multiplier from which a bound gives way, and by how much for each unit beyond. */
+/* Multiplier from which a bound is relaxed, and its slack for each unit of the multiplier beyond. */
 static real penalty(const hmpc_qp *qp, int id, real *yields) {
 #if HMPC_SOFT > 0
   if (id >= SOFT_UPPER) {
@@ -134,7 +134,7 @@ static void transformed(const hmpc_qp *qp, const hmpc_linear *linear, int id, re
     if (a[i] < R(0.0) || a[i] > R(0.0)) hmpc_add(row + i, a[i], qp->inverse[i] + i, HMPC_NV - i);
 }
 
-/* Cholesky factor of the Hessian and the inverse of it. */
+/* Cholesky factor of the Hessian and its inverse. */
 void hmpc_qp_factor(hmpc_qp *qp) {
   real(*const l)[HMPC_LD] = qp->lower_factor;
   qp->definite = 0;
@@ -172,8 +172,8 @@ static void backward(hmpc_working *w, int n, real *b) {
   }
 }
 
-/* Bound w->count, whose number, row and multiplier are set, becomes one of the working set. 0 if it depends on the
-   others: then the row of the factor is L^-1 of its products with them. */
+/* Adds bound w->count, whose number, row and multiplier are set, to the working set. 0 if it depends on the others:
+   then the row of the factor is L^-1 of its products with them. */
 static int join(const hmpc_qp *qp, hmpc_working *w) {
   const int n = w->count;
   real *const row = factor_row(w, n), yields;
@@ -188,7 +188,7 @@ static int join(const hmpc_qp *qp, hmpc_working *w) {
   return 1;
 }
 
-/* Bound number i leaves the working set; what comes behind moves up, one that waits to join too. */
+/* Removes bound i from the working set; later bounds move up, also one that waits to join. */
 static void leave(hmpc_working *w, int i, int waiting) {
   const int n = w->count;
   real column[HMPC_MOST];
@@ -198,7 +198,7 @@ static void leave(hmpc_working *w, int i, int waiting) {
     memmove(to, from, sizeof(real) * (size_t)i);
     memmove(to + i, from + i + 1, sizeof(real) * (size_t)(k - i));
   }
-  /* The factor behind it gets what its column was worth. */
+  /* Rank-one update of the remaining factor by the removed column. */
   for (int k = i + 1; k < n; ++k) {
     real *const pivot = factor_row(w, k - 1) + (k - 1);
     const real old = *pivot, x = column[k], now = hmpc_sqrt(old * old + x * x);
@@ -220,7 +220,7 @@ static void leave(hmpc_working *w, int i, int waiting) {
   w->count = n - 1;
 }
 
-/* A soft bound of the working set gives way from now on, or no longer. */
+/* Switches a soft bound of the working set between kept and relaxed. */
 static void turn(const hmpc_qp *qp, hmpc_working *w, int i, int waiting) {
   const int id = w->id[i], beyond = !w->beyond[i], n = w->count;
   real row[HMPC_LD], multiplier = w->multiplier[i], kept_row[HMPC_LD] = {R(0.0)}, kept = R(0.0);
@@ -237,7 +237,7 @@ static void turn(const hmpc_qp *qp, hmpc_working *w, int i, int waiting) {
   w->beyond[n - 1] = beyond;
   w->multiplier[n - 1] = multiplier;
   memcpy(w->row[n - 1], row, sizeof row);
-  if (join(qp, w) == 0 && waiting == 0) return; /* depends on the others: left out, they bear its multiplier */
+  if (join(qp, w) == 0 && waiting == 0) return; /* it depends on the others and is left out: they take its multiplier */
   if (waiting) {
     const int at = w->count;
     w->id[at] = kept_id;
@@ -247,7 +247,8 @@ static void turn(const hmpc_qp *qp, hmpc_working *w, int i, int waiting) {
   }
 }
 
-/* The longest way, up to 1, that the multipliers may go; who stops them, or -1. */
+/* Largest share of the step, up to 1, that keeps the multipliers within their ranges; who: the bound that limits it, or
+   -1. */
 static real way(const hmpc_qp *qp, const hmpc_working *w, const real *move, int *who) {
   real most = R(1.0);
   *who = -1;
@@ -271,7 +272,7 @@ static real way(const hmpc_qp *qp, const hmpc_working *w, const real *move, int 
   return most;
 }
 
-/* A multiplier has come to an end: zero, so that its bound leaves, or that from which a soft bound gives way. */
+/* A multiplier has reached the end of its range: at zero its bound leaves, at its penalty a soft bound is relaxed. */
 static void stop(const hmpc_qp *qp, hmpc_working *w, int i, int up, int waiting) {
   real yields;
   const real from = penalty(qp, w->id[i], &yields);
@@ -290,7 +291,7 @@ static void primal(const hmpc_qp *qp, const hmpc_working *w, const real *start, 
   for (int i = 0; i < HMPC_NV; ++i) s[i] = hmpc_dot(qp->inverse[i] + i, y + i, HMPC_NV - i);
 }
 
-/* The bound that is violated most, or -1. */
+/* The bound with the largest violation, or -1. */
 static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_working *w, const real *s, real *by) {
   unsigned char inside[SOFT_LOWER + HMPC_DIM(HMPC_SOFT)] = {0};
   int found = -1;
@@ -299,7 +300,7 @@ static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_workin
     inside[w->id[k]] = 1;
     largest = hmpc_max(largest, w->multiplier[k]);
   }
-  /* rounding grows with the multipliers */
+  /* rounding errors increase with the multipliers */
   *by = hmpc_min(HMPC_VIOLATED * R(1e-3) * largest, R(0.1) * HMPC_KEPT);
   for (int i = 0; i < HMPC_NV; ++i) {
     const real before = i >= HMPC_NU ? s[i - HMPC_NU] : R(0.0);
@@ -347,10 +348,10 @@ static hmpc_status checked(const hmpc_qp *qp, const hmpc_linear *linear, hmpc_wo
     add_bound(qp, linear, w->id[k], w->multiplier[k], rest);
     if (!(w->multiplier[k] >= R(0.0))) largest = hmpc_max(largest, -w->multiplier[k]);
     largest = hmpc_max(largest, hmpc_min(hmpc_abs(w->multiplier[k]), hmpc_abs(room)));
-    if (!(from < HMPC_HUGE)) violation = hmpc_max(violation, -room); /* what gives way has no violation */
+    if (!(from < HMPC_HUGE)) violation = hmpc_max(violation, -room); /* a relaxed soft bound is no violation */
   }
   if (worst(qp, linear, w, s, &by) >= 0) violation = hmpc_max(violation, by);
-  real sum = R(0.0); /* NaN where anything is */
+  real sum = R(0.0); /* NaN if any value is NaN */
   for (int i = 0; i < HMPC_NV; ++i) {
     largest = hmpc_max(largest, hmpc_abs(rest[i]));
     size = hmpc_max(size, hmpc_abs(qp->gradient[i]));
@@ -362,7 +363,7 @@ static hmpc_status checked(const hmpc_qp *qp, const hmpc_linear *linear, hmpc_wo
   return w->kkt <= HMPC_KKT_TOLERANCE ? HMPC_SOLVED : HMPC_INACCURATE;
 }
 
-/* Multipliers that keep the working set's bounds exactly, less the present ones. */
+/* Multipliers that keep the working set's bounds exactly, minus the present ones. */
 static void towards(const hmpc_qp *qp, hmpc_working *w, const real *y, real *move) {
   for (int k = 0; k < w->count; ++k) {
     real yields;
@@ -374,7 +375,7 @@ static void towards(const hmpc_qp *qp, hmpc_working *w, const real *y, real *mov
   backward(w, w->count, move);
 }
 
-/* The bounds of the working set met more exactly than the sum of large multipliers does it. */
+/* Refines the solution, because the sum of large multipliers keeps the working set's bounds inexactly. */
 static void polish(const hmpc_qp *qp, hmpc_working *w, real *y, real *s) {
   real move[HMPC_MOST];
   for (int round = 0; round < 2; ++round) {
@@ -387,7 +388,8 @@ static void polish(const hmpc_qp *qp, hmpc_working *w, real *y, real *s) {
   for (int i = 0; i < HMPC_NV; ++i) s[i] = hmpc_dot(qp->inverse[i] + i, y + i, HMPC_NV - i);
 }
 
-/* The bounds that were active, as far as they fit; multipliers stay: any that are not negative may begin. */
+/* Warm start from the previous working set and multipliers: bounds that are finite and independent; any multipliers of
+   zero or more are a valid start. */
 static void warm(const hmpc_qp *qp, const hmpc_linear *linear, hmpc_working *w) {
   const int n = w->count;
   w->count = 0;
@@ -432,7 +434,7 @@ static hmpc_status solved(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
       polish(qp, w, y, qp->step);
       return checked(qp, linear, w, qp->step);
     }
-    refined = id < 0; /* once more, for what rounding left of the way */
+    refined = id < 0; /* one more iteration against rounding errors */
     if (refined) continue;
     if (w->count == HMPC_MOST) break;
     int at = w->count;
@@ -441,7 +443,7 @@ static hmpc_status solved(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
     real yields;
     w->beyond[at] = !(penalty(qp, id, &yields) > R(0.0));
     transformed(qp, linear, id, w->row[at]);
-    while (!join(qp, w)) { /* it depends on the others: their multipliers go down as its own goes up */
+    while (!join(qp, w)) { /* it depends on the others: all multipliers change, the point stays */
       at = w->count;
       real row[HMPC_MOST];
       memcpy(row, factor_row(w, at), sizeof(real) * (size_t)at);
@@ -466,7 +468,7 @@ static hmpc_status solved(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
           up = row[k] < R(0.0);
         }
       }
-      if (id >= SOFT_UPPER && own < most) { /* it gives way before */
+      if (id >= SOFT_UPPER && own < most) { /* it is relaxed first */
         for (int k = 0; k < at; ++k) w->multiplier[k] -= own * row[k];
         w->multiplier[at] += own;
         w->beyond[at] = 1;
@@ -503,7 +505,7 @@ hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
   qp->strict = 1;
   if (solved(qp, w, linear) == HMPC_SOLVED) return HMPC_SOLVED;
   memcpy(qp->step, step, sizeof step);
-  for (int k = 0; k < count; ++k) { /* with what the next solve begins */
+  for (int k = 0; k < count; ++k) { /* warm start of the next solve */
     w->id[k] = id[k];
     w->multiplier[k] = multiplier[k];
   }
@@ -513,7 +515,7 @@ hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
   return status;
 }
 
-/* The working set one period later. */
+/* Shifts the working set by one period. */
 void hmpc_qp_shift(hmpc_working *w) {
   int n = 0;
   for (int k = 0; k < w->count; ++k) {

@@ -1,6 +1,6 @@
-/* Target calculator: the steady state z = F(z, u, w, d) at which outputs are a set-point, or as near to it as limits
-   and bounds allow; of several inputs that do equally well that nearest to the operating point's. Gauss-Newton's
-   method, the steady states eliminated by their null space; bounds are an active set. All loops end after a fixed
+/* Target calculator: the steady state z = F(z, u, w, d) whose outputs are the set-point, or as close to it as limits
+   and bounds allow. Of several equally good inputs it takes that closest to the operating point's. Gauss-Newton method
+   in the null space of the steady-state equations, with an active set for the bounds. All loops end after a fixed
    number of rounds.
 
    Source: Rawlings, Mayne, Diehl, Model Predictive Control, 2017, section 1.5; Nocedal, Wright, Numerical Optimization,
@@ -11,7 +11,7 @@
 
 #if HMPC_OUTPUT_COST
 
-#if HMPC_CURVED /* slopes of the outputs at a point */
+#if HMPC_CURVED /* derivatives of the outputs at a point */
 #define OUTPUT_X(at) ((at)->by_x)
 #define OUTPUT_U(at) ((at)->by_u)
 #else
@@ -21,12 +21,12 @@
 
 enum {
   NT = HMPC_NT,
-  HALVINGS = 10, /* of a step that does not help */
-  SWEEPS = 30,   /* of Jacobi's rotations */
+  HALVINGS = 10, /* of a step that does not reduce the merit */
+  SWEEPS = 30,   /* of Jacobi rotations */
   ROUNDS = 10 * HMPC_TARGET_ROWS
 };
 
-/* What a descent needs to know of v. */
+/* Residual, outputs, derivatives and merit at v. */
 static void look(const hmpc_state *s, const real *v, const real *goal, const real *w, hmpc_point *p) {
   real acts[HMPC_NU], z[HMPC_LZ] = {R(0.0)}, next[HMPC_LZ] = {R(0.0)}, off = R(0.0);
   memcpy(p->v, v, sizeof p->v);
@@ -57,7 +57,7 @@ static void look(const hmpc_state *s, const real *v, const real *goal, const rea
 }
 
 #if HMPC_NH > 0
-/* a x = b in place, by elimination with row exchanges; 0 if a is singular. Rows of a are NT long. */
+/* Solves a x = b in place by elimination with row exchanges; 0 if a is singular. Rows of a have NT entries. */
 static int solve(real (*a)[NT], real *b, int n) {
   for (int k = 0; k < n; ++k) {
     int pivot = k;
@@ -88,7 +88,7 @@ static int solve(real (*a)[NT], real *b, int n) {
 }
 #endif
 
-/* The point v with the hidden state at rest under its state and input, or as it is where that is no better. */
+/* The point v with its hidden state moved to rest under its state and input, or v itself if its merit is lower. */
 static void settle(hmpc_state *s, const real *v, const real *goal, const real *w, hmpc_point *to) {
   look(s, v, goal, w, to);
 #if HMPC_NH > 0
@@ -114,8 +114,8 @@ static void settle(hmpc_state *s, const real *v, const real *goal, const real *w
 #endif
 }
 
-/* Householder's factors of work->a, the largest row first: a = (l, 0) q', where l has the rank's columns, in work->a in
-   front of its row's reflector; order says which row is where. */
+/* Householder factors of work->a with row exchanges, the largest row first: a = (l, 0) q'. l has as many columns as the
+   rank and is stored in work->a before each row's reflector; order: original number of each row. */
 static int factorize(hmpc_search *work, int *order) {
   real first = R(0.0);
   int rank = 0;
@@ -144,7 +144,7 @@ static int factorize(hmpc_search *work, int *order) {
     }
     real *const v = work->a[k];
     const real diagonal = v[k] > R(0.0) ? -size : size;
-    v[k] -= diagonal; /* the reflector 1 - v v' / half, where v[k] is at least size */
+    v[k] -= diagonal; /* the reflector 1 - v v' / half, with |v[k]| of at least size */
     work->half[k] = R(0.5) * hmpc_dot(v + k, v + k, NT - k);
     work->diagonal[k] = diagonal;
     for (int i = k + 1; i < HMPC_NZ; ++i)
@@ -159,12 +159,12 @@ static void rotate(const hmpc_search *work, int rank, real *x) {
     hmpc_add(x + k, -hmpc_dot(work->a[k] + k, x + k, NT - k) / work->half[k], work->a[k] + k, NT - k);
 }
 
-/* The shortest of those x that leave the least of a x - b, from the factors. */
+/* Least-squares solution x of a x = b with the smallest norm, from the factors. */
 static void shortest(hmpc_search *work, int rank, const int *order, const real *b, real *x) {
   const int left = HMPC_NZ - rank;
   real lacks[HMPC_NZ];
   memset(x, 0, sizeof(real) * NT);
-  if (left > 0) { /* rows that depend on those before: k = l2 l1^-1, and w = b1 + k' (1 + k k')^-1 (b2 - k b1) */
+  if (left > 0) { /* rows that depend on earlier ones: k = l2 l1^-1, and w = b1 + k' (1 + k k')^-1 (b2 - k b1) */
     for (int i = 0; i < left; ++i) {
       real *const row = work->a[rank + i];
       for (int j = rank - 1; j >= 0; --j) {
@@ -194,7 +194,7 @@ static void shortest(hmpc_search *work, int rank, const int *order, const real *
   rotate(work, rank, x);
 }
 
-/* Rows of n entries made orthogonal by rotations: their lengths are the singular values. */
+/* Makes rows of n entries orthogonal by rotations; their norms are the singular values. */
 static void orthogonal(real (*rows)[NT], int count, int n) {
   for (int sweep = 0; sweep < SWEEPS; ++sweep) {
     int turned = 0;
@@ -217,7 +217,7 @@ static void orthogonal(real (*rows)[NT], int count, int n) {
   }
 }
 
-/* A row <= end of the QP over the m unknowns eta, scaled to length 1; 0 if no eta keeps it. */
+/* Adds the bound row eta <= end to the QP in the m unknowns eta, scaled to norm 1; 0 if no eta keeps it. */
 static int bound(hmpc_search *work, int m, int sign, real end, int *count) {
   real *const row = work->bound[*count];
   const real size = hmpc_sqrt(hmpc_dot(row, row, m));
@@ -229,7 +229,7 @@ static int bound(hmpc_search *work, int m, int sign, real end, int *count) {
   return 1;
 }
 
-/* Both bounds of a value now + sum of row eta, in its scale. */
+/* Adds both bounds of the scaled value now + row eta. */
 static int bounds(hmpc_search *work, int m, const real *row, real now, real low, real high, int *count) {
   memcpy(work->bound[*count], row, sizeof(real) * (size_t)m);
   if (!bound(work, m, 1, high - now, count)) return 0;
@@ -237,8 +237,8 @@ static int bounds(hmpc_search *work, int m, const real *row, real now, real low,
   return bound(work, m, -1, now - low, count);
 }
 
-/* min 1/2 e'he + g'e with bound e <= end: the point nearest to the free answer in L' e, where h = L L'. Goldfarb and
-   Idnani's dual method, its small systems solved anew in every round. 0 if there is none. */
+/* min 1/2 e'he + g'e with bound e <= end: the point closest to the unconstrained minimum in L' e, where h = L L'. Dual
+   method of Goldfarb and Idnani, whose small systems are solved again in each round. 0 without a solution. */
 static int least_squares(hmpc_search *work, int m, const real *g, int count, real *eta) {
   int active[NT + 1], n = 0;
   real multiplier[NT + 1] = {R(0.0)}, share[NT], start[NT], y[NT];
@@ -270,7 +270,7 @@ static int least_squares(hmpc_search *work, int m, const real *g, int count, rea
     if (round == ROUNDS) return 0;
     const real *const own = work->seen[worst];
     real given = R(0.0);
-    for (int step = 0;; ++step) { /* its multiplier grows until it is kept; others that come to zero leave */
+    for (int step = 0;; ++step) { /* its multiplier increases until it is kept; others at zero leave */
       real rate = hmpc_dot(own, own, m);
       const real size = rate;
       for (int i = 0; i < n; ++i) {
@@ -320,7 +320,7 @@ static int least_squares(hmpc_search *work, int m, const real *g, int count, rea
   return 1;
 }
 
-/* The step that the linearization at work->at asks for; 0 where its QP has no answer. */
+/* Gauss-Newton step at work->at; 0 if its QP has no solution. */
 static int newton(hmpc_search *work, const real *goal, int bounded, real *step) {
   const hmpc_point *const at = &work->at;
   const real *const u = at->v + HMPC_NZ;
@@ -336,8 +336,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
     row[i] = -at->rest[i] / target_heed[i];
   }
   const int rank = factorize(work, order), m = NT - rank;
-  shortest(work, rank, order, row, onto); /* to the steady states */
-  for (int k = 0; k < m; ++k) {           /* and along them */
+  shortest(work, rank, order, row, onto); /* step onto the steady states */
+  for (int k = 0; k < m; ++k) {           /* directions along them */
     memset(work->along[k], 0, sizeof work->along[k]);
     work->along[k][rank + k] = R(1.0);
     rotate(work, rank, work->along[k]);
@@ -354,7 +354,7 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   memcpy(work->turned, sees, sizeof sees);
   orthogonal(work->turned, tracked, m);
   for (int i = 0; i < tracked; ++i) size = hmpc_max(size, hmpc_sqrt(hmpc_dot(work->turned[i], work->turned[i], m)));
-  work->answer = R(0.0); /* do outputs answer to inputs as they do at the operating point? */
+  work->answer = R(0.0); /* negative if outputs react to inputs opposite to the operating point */
   for (int i = 0; i < tracked; ++i)
     for (int k = 0; k < m; ++k)
       work->answer += sees[i][k] * hmpc_dot(target_slopes[i], work->along[k] + HMPC_NZ, HMPC_NU);
@@ -367,7 +367,7 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
       hmpc_add(work->h[k], sees[i][k] * factor, sees[i], m);
     }
   }
-  for (int j = 0; j < HMPC_NU; ++j) { /* what outputs do not see goes towards the operating point's input */
+  for (int j = 0; j < HMPC_NU; ++j) { /* directions that the outputs do not determine: towards u_rest */
     const real far = (u_rest[j] - u[j]) / target_scale[HMPC_NZ + j] - onto[HMPC_NZ + j];
     for (int k = 0; k < m; ++k) row[k] = work->along[k][HMPC_NZ + j];
     memcpy(eta, row, sizeof eta);
@@ -416,7 +416,7 @@ static void place(const hmpc_steady *from, real *v) {
   memcpy(v + HMPC_NZ, from->u, sizeof from->u);
 }
 
-/* Gauss-Newton from v; bounded: within the bounds of states and outputs. */
+/* Gauss-Newton method from v; bounded: within the bounds of states and outputs. */
 static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_descent *found) {
   hmpc_search *const work = &s->search;
   hmpc_point *const at = &work->at, *const after = &work->after;
@@ -437,7 +437,7 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
     for (int i = 0; i < NT; ++i) there[i] = at->v[i] + step[i];
     settle(s, there, goal, w, after);
     if (!(after->merit < at->merit) && !(size < HMPC_TARGET_NEAR)) {
-      /* watchdog: along a curved branch a step leaves it by its square, and the next one comes back to it */
+      /* watchdog: on a curved branch a step has an error of second order, which the next step corrects */
       const real answer = work->answer;
       real second[NT], again = R(0.0);
       work->kept = *at;
@@ -460,7 +460,7 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       settle(s, there, goal, w, after);
       if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
-    if (!(after->merit < at->merit)) { /* rounding is all that is left, or it gets nowhere */
+    if (!(after->merit < at->merit)) { /* only rounding errors remain, or there is no progress */
       done = size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
       break;
     }
@@ -495,9 +495,10 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
   found->lost = done && off > HMPC_TARGET_REACHED && work->answer < target_flat[0];
 }
 
-/* The steady state to which set-points on the way to y lead, by parts that keep Newton's method contracting: from a steady
-   state v under the disturbances at hand, or with v = NULL from the operating point, or where its run ends, and with the
-   disturbances from none. Returns whether the way was gone to its end; sure = 0: by any steady states. */
+/* Follows the steady states of set-points on the line to y, in parts in which Newton's method contracts. It starts at
+   the steady state v under the present disturbances; with v = NULL at the operating point or the end of its run, with
+   disturbances that grow from none. Returns whether y was reached; sure = 0: any steady states on the line are
+   valid. */
 static int follow(hmpc_state *s, const real *v, const real *y, const real *w, int sure, hmpc_descent *found) {
   hmpc_search *const work = &s->search;
   real begun[HMPC_NY], towards[HMPC_NY], at[NT], done = R(0.0), part = R(HMPC_TARGET_FOLLOWED);
@@ -528,8 +529,8 @@ static int follow(hmpc_state *s, const real *v, const real *y, const real *w, in
   return arrived;
 }
 
-/* Of n descents that ended at a steady state, sure ones before others, that nearest to the set-point, and of those that are
-   equally near to it, to the operating point; -1 if there is none. */
+/* Of n descents, the one whose steady state is closest to the set-point; of equally close ones, that closest to the
+   operating point. Sure ones have priority. -1 if none ended at a steady state. */
 static int best(const hmpc_search *work, int n) {
   int some = 0, chosen = -1;
   real least = HMPC_HUGE;
@@ -545,8 +546,8 @@ static int best(const hmpc_search *work, int n) {
   return chosen;
 }
 
-/* The steady state for outputs y, all finite where they are weighed; the order of the search is that of Targets.at in
-   Python. Where none keeps the bounds of states and outputs, these are left out. */
+/* Steady state for outputs y; weighted outputs are finite. The search has the order of Targets.at in Python. If no
+   steady state keeps the bounds of states and outputs, it is searched without them. */
 void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
                        hmpc_steady *found) {
   hmpc_search *const work = &s->search;
@@ -599,12 +600,12 @@ static void set_target(hmpc_target *to, int k, const real *x, const real *u, con
   if (k < HMPC_N) memcpy(to->u[k], u, sizeof to->u[k]);
 }
 
-/* Without measured disturbances there is one empty row of them. */
+/* Without measured disturbances, w has one empty row. */
 #define W_OF(period) (HMPC_NW > 0 ? (period) : 0)
 
 /* References of states, inputs and outputs over the horizon, under the measured disturbances s->linear.w: a steady
-   state for each change of the preview; of one that changes more often for so many rows, and between them
-   interpolated. */
+   state for each change of the preview. If it changes more than HMPC_TARGET_KNOTS times, steady states of that many
+   rows are interpolated. */
 void hmpc_aim(hmpc_state *s, const hmpc_goal *goal) {
   hmpc_target *const to = &s->target;
   const real(*const w)[HMPC_DIM(HMPC_NW)] = s->linear.w;
@@ -637,7 +638,7 @@ void hmpc_aim(hmpc_state *s, const hmpc_goal *goal) {
   for (int n = 0; n < count; ++n) {
     const int k = knots[n] = often ? target_knots[n] : knots[n];
     hmpc_steady_state(s, to->y[k], w[W_OF(k < HMPC_N ? k : HMPC_N - 1)], &start, wide, &found);
-    wide = found.steady; /* where nothing was found, the rest of the horizon is not searched as widely again */
+    wide = found.steady; /* without a steady state, the rest of the horizon is searched less widely */
     if (found.steady) start = found;
     if (n == 0) s->aimed = found;
     for (int i = 0; i < HMPC_NX; ++i) x[n][i] = found.steady ? found.x[i] : x_rest[i];

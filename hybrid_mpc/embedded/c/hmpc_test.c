@@ -1,13 +1,13 @@
-/* Replays hmpc_vectors.h, what the Python controller decided: samples in, inputs and estimates compared.
+/* Replays hmpc_vectors.h, samples and decisions of the Python controller, and compares inputs and estimates.
    Exit status 0 if all agree. */
 #include <stdio.h>
 #include "hmpc_math.h"
 #include "hmpc_vectors.h"
 
-static hmpc_state state; /* 8-byte numbers at the machine's ease; the library itself has no such thing */
+static hmpc_state state; /* 8-byte numbers in the computer's own byte order; the library itself uses none */
 
 #if HMPC_MONITOR
-/* Largest deviation of what the monitor says from what Python's said, of its size. */
+/* Largest relative deviation of the monitor's values from those of Python. */
 static real reading_off(int k) {
   const hmpc_monitor *const m = &state.monitor;
   const real *const wanted = vector_reading[k];
