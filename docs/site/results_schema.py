@@ -14,7 +14,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hybrid_mpc.records import BESIDE
-from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, Results
 
 SIMPLE = {float: "number", int: "whole number", str: "text", bool: "true or false", Any: "any"}
@@ -141,7 +140,7 @@ def page() -> str:
         lines += [f"## `{name}`", "", summary(kind), "", *table(kind, fields_of(kind)), ""]
         ahead += [k for hint in typing.get_type_hints(kind).values() for k in inner(hint)]
     lines += ["## Objects in them", ""]
-    seen: set[Any] = {Absent}
+    seen: set[Any] = set()
     while ahead:
         kind = ahead.pop(0)
         if kind not in seen:
