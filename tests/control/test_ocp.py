@@ -34,7 +34,7 @@ GOOD = {
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"horizon": 0}, "horizon"),
+        ({"horizon": 0}, "HM-CONTROL-011"),
         ({"horizon": 2.5}, "horizon"),
         ({"horizon": np.nan}, "horizon"),
         ({"horizon": np.inf}, "horizon"),

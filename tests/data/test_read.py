@@ -145,7 +145,7 @@ def test_bad_rows_of_csv(tmp_path):
 def test_bad_vectors(tmp_path, vectors):
     for columns, match in (
         ({**GOOD, "phi": T[:-1]}, r"'time_s' 60, 'tau' 60, 'phi' 59.*HM-DATA-110"),
-        ({**GOOD, "phi": np.ones((60, 2))}, "phi.*shape" if vectors == "npz" else "HM-DATA-085"),
+        ({**GOOD, "phi": np.ones((60, 2))}, "HM-DATA-112" if vectors == "npz" else "HM-DATA-085"),
         ({**GOOD, "phi": T + 1j}, r"'phi'.*complex numbers.*HM-DATA-111"),
         ({**GOOD, "phi": "text"}, r"'phi'.*text.*HM-DATA-111"),
         ({**GOOD, "time_s": 0.0}, "HM-DATA-113"),
