@@ -33,6 +33,15 @@ def problem(*hard, horizon=25, **others):
     return OCP(horizon, [10.0, 0.1], [0.01], [0.0], [-3.0], [3.0], hard=hard, **others)
 
 
+def test_whatever_it_costs_a_bound_that_can_be_kept_is_kept():
+    """A reference so far beyond the bound that its multiplier is above any fixed penalty."""
+    ocp = problem(HardBound("x", [-np.inf, -np.inf], [0.8, np.inf]))
+    plan = plan_of(CondensedController(MODEL, ocp), estimate_of(MODEL, [0.0, 0.0]), np.array([[1e6, 0.0]]))
+    assert plan.status is Status.SOLVED
+    assert dict(plan.given_way) == {}
+    assert np.max(plan.x[:, 0]) <= 0.8 + 1e-6
+
+
 def reachable(z, horizon=25, limit=0.5):
     """Whether some plan keeps the position below the limit, by a linear program."""
     by_u, x0 = np.zeros((horizon, horizon)), []

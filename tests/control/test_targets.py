@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from control_parts import plan_of
 from gated import gated
-from machines import dc_motor, rest_levels, thermal, two_tanks
+from machines import AMBIENT, HEAT, dc_motor, rest_levels, thermal, two_tanks
 
 from hybrid_mpc import (
     OCP,
@@ -206,6 +206,20 @@ def test_all_solvers_agree_on_outputs_bounds_and_what_comes(kind):
     assert np.max(1e4 * (sqp.u + inflow)) > 3.9  # the bound on both flows acts
     held = plan_of(SQPController(model, ocp), *given)
     assert np.max(np.abs(held.u - sqp.u)) > 1e-6
+
+
+def test_limits_hold_whatever_is_asked():
+    rng = np.random.default_rng(0)
+    model, ocp = thermal(), OCP(8, **HEATERS, du_max=[3.0, 3.0], q_y=[1.0, 1.0])
+    safe = SafeController(CondensedController(model, ocp), model, safe_input=[0.0, 0.0])
+    decision = safe.initial(estimate_at(model))
+    np.testing.assert_array_equal(decision.u, HEAT)
+    for _ in range(15):
+        x, d = AMBIENT + rng.normal(size=2) * 60, rng.normal(size=2) * 10
+        goal = rng.choice([rng.uniform(-200, 400), np.nan], p=[0.8, 0.2], size=2)
+        before, decision = decision, safe.decide(decision, estimate_at(model, x, d), goal[None])
+        assert np.all((decision.u >= 0) & (decision.u <= 20))
+        assert np.all(np.abs(decision.u - before.u) <= 3.0 + 1e-12)
 
 
 def test_a_fallback_holds_the_set_point():

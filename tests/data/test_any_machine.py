@@ -356,6 +356,11 @@ def test_delays_are_taken_off_each_side_of_a_gap(tmp_path):
         np.testing.assert_allclose(late.u, whole.u[: len(late.u)], atol=1e-9)  # the same inputs, later
 
 
+def test_delays_longer_than_a_piece_leave_nothing(tmp_path):
+    (told,) = problems(wrote(tmp_path), replace(SPEC, delays={"u": 7.0}))
+    assert "shorter than the 0.4 s" in told
+
+
 def test_bad_delays(tmp_path):
     file = wrote(tmp_path)
     spec = replace(SPEC, delays={"yy": 0.1}, delays_of={"run": {"t": 0.1}})

@@ -235,6 +235,20 @@ def test_where_none_is_stable_the_best_is_taken_and_says_so(fit):
     assert model.chosen.radius == pytest.approx(1.05, rel=1e-6)  # the bias of a growing mean costs digits
 
 
+def test_a_candidate_whose_filter_cannot_be_made_is_passed_over(monkeypatch):
+    make = linear._gain
+
+    def gain(a, *given):
+        if len(a) == 4:
+            raise InputError("as of an A far from stable")
+        return make(a, *given)
+
+    monkeypatch.setattr(linear, "_gain", gain)
+    model = fit_subspace(*recordings(system(), noise=0.3), 0.1, warm=10)
+    assert model.chosen.order != 4
+    assert {c.error for c in model.candidates if c.order == 4} == {np.inf}
+
+
 @both
 def test_the_order_follows_the_free_run_and_the_least_that_is_alike(fit):
     train, valid = recordings(system(), noise=0.3)
@@ -273,6 +287,7 @@ def test_many_windows_are_each_its_own_free_run(fit):
             x = model.A @ x + model.B @ scaled[i, k] + model.bias
     stacked = model.free_run(y[:20, :10].reshape(4, 5, 10, 2), u[:20].reshape(4, 5, 50, 2))
     assert np.allclose(stacked.reshape(20, 40, 2), y_hat[:20], rtol=0, atol=1e-9)
+    assert model.free_runs([], 10) == []
 
 
 # what is refused, what is doubtful
