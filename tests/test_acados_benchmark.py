@@ -64,34 +64,6 @@ def test_without_acados_the_driver_has_none_of_its_solvers(hard):
 
 
 @pytest.mark.full
-@softness
-def test_numbers_that_cost_something_else_are_refused(soft, monkeypatch):
-    case = own.made(4, N, soft=soft)
-    own.check_data(case)
-    data = own.problem_data(case)
-    other = {**data, "linear": 1.01 * data["linear"]} if soft else {**data, "w": 1.01 * data["w"]}
-    monkeypatch.setattr(own, "problem_data", lambda _: other)
-    with pytest.raises(SystemExit):
-        own.check_data(case)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("given", [False, True])
-def test_without_an_installation_it_says_how_to_build_one(given, tmp_path):
-    done = script(*(["--acados", str(tmp_path)] if given else []))
-    assert done.returncode == 1
-    assert "cmake .. -DACADOS_WITH_DAQP=ON" in done.stderr
-    assert ("libacados" in done.stderr) == given  # what is missing there
-
-
-def test_the_version_is_that_of_a_checkout_or_of_the_build(tmp_path):
-    assert own.version_of(tmp_path).startswith("unknown")
-    (tmp_path / "lib").mkdir()
-    (tmp_path / "lib" / "git_commit_hash").write_text("21376cb1a")
-    assert own.version_of(tmp_path) == "commit 21376cb1a"
-
-
-@pytest.mark.full
 @compiler
 @installed
 def test_acados_solves_what_the_library_solves(tmp_path):

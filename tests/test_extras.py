@@ -6,12 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from patience import HANGS
 
 import hybrid_mpc as hm
-from hybrid_mpc.compare.step_response import step_response
 from hybrid_mpc.errors import EXTRAS, MissingPackage, named_extra
 
 TRAIN = ("torch", "optuna")
@@ -190,14 +188,3 @@ def test_a_missing_package_is_both_an_input_error_and_an_import_error():
         named_extra(),
     ):  # what no extra brings is the user's own
         raise ModuleNotFoundError("No module named 'mine'", name="mine")
-
-
-@pytest.mark.parametrize("damping", [0.3, 0.7, 1.0])
-def test_figures_of_a_step_are_those_of_python_control(damping):
-    control = pytest.importorskip("control")
-    t = np.linspace(0.0, 20.0, 2001)
-    _, y = control.step_response(control.tf([1.0], [1.0, 2 * damping, 1.0]), t)
-    want = control.step_info(y, T=t, yfinal=1.0, SettlingTimeThreshold=0.05)
-    found = step_response(t, y, np.ones(t.size))
-    assert (found.rise, found.settling) == (want["RiseTime"], want["SettlingTime"])
-    assert found.overshoot == pytest.approx(want["Overshoot"], abs=1e-9)

@@ -151,23 +151,6 @@ def test_users_import_public_names_only():
         assert not [found for source in python_of(path) for found in foreign(source)], path
 
 
-@pytest.mark.parametrize(
-    "source",
-    [
-        "from hybrid_mpc.control.ocp import OCP",
-        "import hybrid_mpc.kit.artifact",
-        "from hybrid_mpc.plots.loops import Motion",
-        "from hybrid_mpc import mpc",
-        "def late():\n    from hybrid_mpc.machine.torch_prior import Prior",
-    ],
-)
-def test_what_is_not_public_is_noticed(source):
-    assert foreign(source)
-    assert not foreign(
-        "import hybrid_mpc as hm\nfrom hybrid_mpc import OCP, plots\nfrom hybrid_mpc.plots import save"
-    )
-
-
 def test_examples_were_found():
     found = [path for path in USERS if any(list(imported(source)) for source in python_of(path))]
     assert len([p for p in found if p.suffix == ".ipynb"]) >= 7

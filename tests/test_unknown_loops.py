@@ -116,13 +116,6 @@ def test_a_loop_that_is_off_by_more_than_the_noise_has_not_settled():
     assert loop.cost == pytest.approx(25.0 * 0.25, rel=0.02)  # the weight times the load's effect, squared
 
 
-def test_an_interval_is_that_of_the_logarithms():
-    mean, low, high = own.interval([0.5, 2.0, 1.0])
-    assert mean == pytest.approx(1.0)
-    assert low * high == pytest.approx(1.0)
-    assert np.log(high) == pytest.approx(4.3027 * np.log(2.0) / np.sqrt(3), rel=1e-3)
-
-
 def test_every_textbook_machine_has_a_plant_that_rests_or_works():
     for machine in (*PROCESSES, *MOTION):
         plant = PLANTS[machine.name]

@@ -23,7 +23,17 @@ SHARED = Path(__file__).parents[3] / "shared"
 # Machines
 
 
-@pytest.mark.parametrize("name", benchmark.MACHINES)
+QUICK = ("data/cascaded_tanks", "data/emps", "data/temperature_lab", "data/unbalanced_disk")
+"""Machines with short recordings; the full set has all."""
+
+
+def of_machines(names):
+    """Names of machines, of which the quick set takes few."""
+    marked = [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in names]
+    return pytest.mark.parametrize("name", marked)
+
+
+@of_machines(benchmark.MACHINES)
 def test_machines_are_told_right_without_options(name):
     if not (SHARED / name).is_dir():
         pytest.skip(f"the recordings of {name} are not here")
@@ -46,7 +56,7 @@ OPEN = {
 }
 
 
-@pytest.mark.parametrize("name", sorted(CLOSED | OPEN))
+@of_machines(sorted(CLOSED | OPEN))
 def test_closed_loops_are_seen_without_names(name):
     """By the numbers alone, but for one: a servo of small gain whose recordings hold a set-point."""
     if not (SHARED / name).is_dir():
@@ -54,17 +64,6 @@ def test_closed_loops_are_seen_without_names(name):
     for row in benchmark.machines(SHARED, nameless=False, only=[name]):
         assert ("closed loop" in row["said"]) is (name in CLOSED)
         assert ("unstable" in row["said"]) is (name == "cases/rotary_pendulum")
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["data/cascaded_tanks", "data/emps", "data/quarter_drone", "data/unbalanced_disk", "cases/rotary_pendulum",
-     "cases/stirred_tank"],
-)  # fmt: skip
-def test_some_are_told_right_even_without_names(name):
-    if not (SHARED / name).is_dir():
-        pytest.skip(f"the recordings of {name} are not here")
-    assert all(row["right"] for row in benchmark.machines(SHARED, nameless=True, only=[name]))
 
 
 @pytest.mark.full
@@ -203,17 +202,6 @@ def test_what_a_drive_measures_stands_in_for_a_command_that_is_not_recorded():
         "tau_cmd": "input",
         "angle": "output",
     }
-
-
-def test_recordings_of_a_few_rows(tmp_path):
-    """Too short for all: refused with the reader's reason."""
-    rng = np.random.default_rng(0)
-    files = []
-    for k in range(6):
-        columns = {name: rng.standard_normal(5) for name in ("c1", "c2", "tau", "tau_cmd")}
-        files.append(write_csv(tmp_path / f"{k}.csv", {"time_s": 0.1 * np.arange(5), **columns}))
-    with pytest.raises(InputError):
-        write_scenario(tmp_path / "m.py", files)
 
 
 def test_units_decide_where_names_do_not():

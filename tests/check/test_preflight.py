@@ -174,69 +174,36 @@ def nothing(x, u, m):
 
 
 PLACE = "test_preflight.py"
-EACH = "one for each of level, warmth is needed"
-AT = ["at x = [0.0, 0.0], u = [0.0]", "within the signals' ranges"]
 IN_BOTH = {
     # what a user gets wrong in the same way in CasADi and in torch
-    "too few rates": (flow(lambda x, u, p, m: u.inflow / p.area),
-                      ["Changed.xdot(x, u, w, p) must give 2 values, got 1: " + EACH]),
-    "too many rates": (flow(*3 * [lambda x, u, p, m: u.inflow]), ["must give 2 values, got 3: " + EACH]),
-    "no tuple": (members(xdot=lambda self, x, u, w, p: u.inflow), ["must give 2 values, got 1: " + EACH]),
-    "no return": (members(xdot=lambda self, x, u, w, p: None), ["Changed.xdot", "NoneType", "missing 'return'"]),
-    "xdot raises": (members(xdot=lambda self, x, u, w, p: raises()), ["prior raised KeyError: 'forgotten'", PLACE]),
-    "a typing error": (flow(lambda x, u, p, m: x.levle), ["no component 'levle'", "level, warmth", PLACE]),
-    "no such parameter": (level(lambda x, u, p, m: p.volume), ["no component 'volume'", "area, k", PLACE]),
-    "output of another shape": (members(output=lambda self, x, u, w, p: (x.level,)),
-                                ["Changed.output(x, u, w, p) must give 2 values, got 1: " + EACH]),
-    "output without return": (members(output=lambda self, x, u, w, p: None), ["Changed.output", "missing 'return'"]),
-    "output raises": (members(output=lambda self, x, u, w, p: raises()), ["prior raised KeyError", PLACE]),
-    "an output that is no state": (members(outputs=(Tank.states[0], Signal("hot", "K"))),
-                                   ["no state is called hot", "level, warmth", "Define output(x, u, w, p)"]),
-    "NaN": (level(lambda x, u, p, m: m.sqrt(x.level - 0.5)), ["xdot(x, u, w, p): its value is not finite", *AT]),
-    "infinite": (level(lambda x, u, p, m: u.inflow / x.level), ["xdot(x, u, w, p): its value is not finite", *AT]),
-    "infinite slope": (level(lambda x, u, p, m: u.inflow - m.sqrt(x.level)),
-                       ["xdot(x, u, w, p): its derivative by x is not finite", *AT, "fmax(level, 1e-6)"]),
-    "infinite slope by an input": (level(lambda x, u, p, m: m.sqrt(u.inflow)), ["its derivative by u is", *AT]),
-    "infinite slope by a parameter": (level(lambda x, u, p, m: x.level**p.k * u.inflow**p.k),
-                                      ["its derivative by", "is not finite", *AT]),
-    "NaN of an output": (members(output=lambda self, x, u, w, p: (1 / x.level, x.warmth)),
-                         ["output(x, u, w, p): its value is not finite", *AT]),
-    "balance with a wrong sign": (balance(warmth, lost), ["balance heat [W]: dS/dt - supply + loss is", "at x = ",
-                                                          "HM-CHECK-057"]),
-    "balance without a term": (balance(warmth, nothing), ["HM-CHECK-057"]),
-    "negative loss": (balance(warmth, lambda x, u, m: -0.2 * x.warmth, lambda x, u, m: -0.1 * x.warmth),
-                      ["balance heat [W]: the loss is -", "at x = ", "HM-CHECK-058"]),
-    "balance of NaN": (balance(lambda x, u, m: m.log(x.warmth), lambda x, u, m: -0.1 + 0 * x.warmth, unit="1"),
-                       ["balance heat [W]: not finite", *AT]),
-    "storage of the input": (balance(lambda x, u, m: x.warmth * u.inflow, nothing, lost),
-                             ["balance heat: the storage", "HM-MACHINE-018"]),
-    "balance of nothing": (balance(nothing, lost, lost), ["balance heat [W]: the storage does not depend on "
-                                                          "level, warmth", "HM-CHECK-055"]),
-    "balances that are none": (members(balances=lambda self, x, u, w, p: (x.level,)),
-                               ["Changed.balances(x, u, w, p) must give a tuple of Balance(...)"]),
-    "one balance without its tuple": (members(balances=lambda self, x, u, w, p: Balance("heat", x.warmth, 0.0)),
-                                      ["must give a tuple of Balance(...)"]),
-    "balances of one name": (members(balances=lambda self, x, u, w, p: 2 * (Balance("heat", x.warmth, 0.0),)),
-                             ["['heat', 'heat']", "HM-MACHINE-017"]),
-    "corrects no state": (members(corrects=("levle",)), ["corrects names levle", "the states are level, warmth"]),
-    "operating point of one": (members(operating_point=OperatingPoint((0.2,), (0.1,))),
-                               ["operating_point: x must have 2 numbers (level, warmth), got 1: (0.2,)"]),
-    "operating point without input": (members(operating_point=OperatingPoint((0.2, 9.0), ())),
-                                      ["operating_point: u must have 1 numbers (inflow), got 0"]),
-    "operating point with a disturbance": (members(operating_point=OperatingPoint((0.2, 9.0), (0.1,), (1.0,))),
-                                           ["operating_point: w must have 0 numbers (none), got 1"]),
-    "operating point out of range": (members(operating_point=OperatingPoint((0.2, 100.0), (0.1,))),
-                                     ["x = (0.2, 100.0) is outside the range of warmth [K]", "HM-CHECK-045"]),
-    "operating point of numbers": (members(operating_point=(0.2, 9.0)),
-                                   ["operating_point must be OperatingPoint(x=(...), u=(...)), got (0.2, 9.0)"]),
-    "parameters of one name": (members(parameters=(*Tank.parameters, Parameter("k", 1.0, "-", 0.0, 2.0))),
-                               ["parameters must have different names, got ['area', 'k', 'k']"]),
-    "states of one name": (members(states=(Tank.states[0], Tank.states[0])), ["states must have different names"]),
-    "no states": (members(states=()), ["states must be a tuple of at least one Signal, got ()"]),
-    "states that are texts": (members(states=("level", "warmth")), ["Changed: states must be a tuple of Signal"]),
-    "parameters by name": (members(parameters={"k": 1.0}), ["parameters must be a tuple of Parameter", "{'k': 1.0}"]),
+    "no tuple": (members(xdot=lambda self, x, u, w, p: u.inflow), "HM-CHECK-060"),
+    "xdot raises": (members(xdot=lambda self, x, u, w, p: raises()), "HM-CHECK-061"),
+    "a typing error": (flow(lambda x, u, p, m: x.levle), "HM-MACHINE-044"),
+    "no such parameter": (level(lambda x, u, p, m: p.volume), "HM-MACHINE-044"),
+    "output raises": (members(output=lambda self, x, u, w, p: raises()), "HM-CHECK-061"),
+    "NaN": (level(lambda x, u, p, m: m.sqrt(x.level - 0.5)), "HM-CHECK-051"),
+    "infinite slope": (level(lambda x, u, p, m: u.inflow - m.sqrt(x.level)), "HM-CHECK-051"),
+    "infinite slope by a parameter": (level(lambda x, u, p, m: x.level**p.k * u.inflow**p.k), "HM-CHECK-051"),
+    "NaN of an output": (members(output=lambda self, x, u, w, p: (1 / x.level, x.warmth)), "HM-CHECK-051"),
+    "balance with a wrong sign": (balance(warmth, lost), "HM-CHECK-057"),
+    "negative loss": (
+        balance(warmth, lambda x, u, m: -0.2 * x.warmth, lambda x, u, m: -0.1 * x.warmth), "HM-CHECK-058",
+    ),
+    "balance of NaN": (
+        balance(lambda x, u, m: m.log(x.warmth), lambda x, u, m: -0.1 + 0 * x.warmth, unit="1"), "HM-CHECK-056",
+    ),
+    "balance of nothing": (balance(nothing, lost, lost), "HM-CHECK-055"),
+    "operating point of one": (members(operating_point=OperatingPoint((0.2,), (0.1,))), "HM-CHECK-044"),
+    "operating point out of range": (members(operating_point=OperatingPoint((0.2, 100.0), (0.1,))), "HM-CHECK-045"),
+    "operating point of numbers": (members(operating_point=(0.2, 9.0)), "HM-CHECK-043"),
+    "parameters of one name": (
+        members(parameters=(*Tank.parameters, Parameter("k", 1.0, "-", 0.0, 2.0))), "HM-CHECK-036",
+    ),
+    "states of one name": (members(states=(Tank.states[0], Tank.states[0])), "HM-CHECK-035"),
+    "no states": (members(states=()), "HM-CHECK-034"),
+    "states that are texts": (members(states=("level", "warmth")), "HM-MACHINE-005"),
 }  # fmt: skip
-"""Members of a class, made by a function of the module that the tank is written in, and words of what is told."""
+"""Members of a class, made by a function of the module that the tank is written in, and the code of the error."""
 BLIND = {"outputs": Tank.outputs[:1]}
 """A tank whose temperature nobody measures, and which the level does not hang on."""
 TOGETHER = {
@@ -248,100 +215,71 @@ TOGETHER = {
 """Only the sum of two states can be seen."""
 WRONG = {
     # the prior
-    "raises when made": (field(prior=raises), ["prior raised KeyError"]),
-    "is no prior": (field(prior=lambda values=None: 3), ["makes a int"]),
-    "ignores its values": (field(prior=lambda values=None: Pendulum({"J": 0.06} if values is None else None)),
-                           ["HM-CHECK-033"]),
-    "takes no values": (field(prior=lambda: Pendulum()), ["prior raised TypeError"]),
-    "no xdot": (field(prior=type("Empty", (Prior,), {k: getattr(Tank, k) for k in ("states", "inputs", "outputs")})),
-                ["Empty must define xdot(x, u, w, p)"]),
-    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)),
-                     ["data: 0 columns of disturbances [], but the prior has 1: ['wind']"]),
+    "raises when made": (field(prior=raises), "HM-CHECK-061"),
+    "is no prior": (field(prior=lambda values=None: 3), "HM-CHECK-032"),
+    "ignores its values": (
+        field(prior=lambda values=None: Pendulum({"J": 0.06} if values is None else None)), "HM-CHECK-033",
+    ),
+    "takes no values": (field(prior=lambda: Pendulum()), "HM-CHECK-061"),
+    "no xdot": (
+        field(prior=type("Empty", (Prior,), {k: getattr(Tank, k) for k in ("states", "inputs", "outputs")})),
+        "HM-CHECK-061",
+    ),
+    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)), "HM-CHECK-016"),
     # a mechanical prior
-    "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), ["mass_matrix(q, p) is 0.0", "be positive"]),
-    "negative inertia": (prior(mass_matrix=lambda self, q, p: -p.J), ["mass_matrix(q, p) is -0.1", "be positive"]),
-    "no inertia": (prior(mass_matrix=MechanicalPrior.mass_matrix), ["must define mass_matrix(q, p)"]),
-    "inertia without return": (prior(mass_matrix=lambda self, q, p: None), ["HM-MACHINE-003"]),
-    "inertia of two": (prior(mass_matrix=lambda self, q, p: ((p.J, 0), (0, p.J))), ["1 rows of 1 values", "got 4"]),
-    "friction that drives": (prior(friction=lambda self, q, v, p: -0.1 * v.phi_dot),
-                             ["balance energy [W]: the loss is -", "HM-CHECK-058"]),
-    "friction of two": (prior(friction=lambda self, q, v, p: (v.phi_dot, v.phi_dot)),
-                        ["Changed.friction(q, v, p) must give 1 values, got 2: one for each of phi_dot"]),
-    "potential without return": (prior(potential=lambda self, q, p: None), ["Changed.potential(q, p)", "'return'"]),
-    "force of two": (prior(force=lambda self, q, v, u, w, p: (u.tau, u.tau)), ["got 2: one for each of phi_dot"]),
-    "two inputs and no force": (lambda: prior(inputs=(Signal("a", "N"), Signal("b", "N")))() | data(inputs=("a", "b")),
-                                ["2 inputs for 1 degrees of freedom", "HM-MACHINE-002"]),
-    "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), ["[q, v] in pairs"]),
+    "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), "HM-CHECK-049"),
+    "no inertia": (prior(mass_matrix=MechanicalPrior.mass_matrix), "HM-CHECK-061"),
+    "inertia without return": (prior(mass_matrix=lambda self, q, p: None), "HM-MACHINE-003"),
+    "inertia of two": (prior(mass_matrix=lambda self, q, p: ((p.J, 0), (0, p.J))), "HM-MACHINE-004"),
+    "friction that drives": (prior(friction=lambda self, q, v, p: -0.1 * v.phi_dot), "HM-CHECK-058"),
+    "friction of two": (prior(friction=lambda self, q, v, p: (v.phi_dot, v.phi_dot)), "HM-MACHINE-016"),
+    "potential without return": (prior(potential=lambda self, q, p: None), "HM-MACHINE-015"),
+    "force of two": (prior(force=lambda self, q, v, u, w, p: (u.tau, u.tau)), "HM-MACHINE-016"),
+    "two inputs and no force": (
+        lambda: prior(inputs=(Signal("a", "N"), Signal("b", "N")))() | data(inputs=("a", "b")), "HM-MACHINE-002",
+    ),
+    "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), "HM-MACHINE-001"),
     # data
-    "too few columns": (field(data=dataclasses.replace(DATA, inputs=())), ["0 columns of inputs", "'tau'"]),
-    "too many columns": (field(data=dataclasses.replace(DATA, outputs=("phi", "x"))), ["2 columns of outputs"]),
-    "unknown cause": (field(causes={"mass": ("m",)}), ["no parameter m", "J, mgl"]),
+    "too few columns": (field(data=dataclasses.replace(DATA, inputs=())), "HM-CHECK-016"),
+    "unknown cause": (field(causes={"mass": ("m",)}), "HM-CHECK-017"),
     # control
-    "horizon 0": (control(horizon=0), ["HM-CONTROL-011"]),
-    "horizon half": (control(horizon=2.5), ["HM-CONTROL-011"]),
-    "crossed bounds": (control(u_min=(1,), u_max=(-1,)), ["HM-MODEL-013", "u_min"]),
-    "NaN weight": (control(q=(math.nan, 1)), ["q: weights must be finite and not negative"]),
-    "negative weight": (control(r=(-1,)), ["r: weights must be finite and not negative"]),
-    "no weight at all": (control(r=(0,), r_delta=(0,)), ["every input needs a positive weight"]),
-    "weights of too few": (
-        field(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["HM-CHECK-023"]
-    ),
-    "inputs of too many": (
-        field(control=OCP(10, (25, 1), (1, 1), (1, 1), (-1, -1), (1, 1))), ["control: r must have 1 numbers, got 2"]
-    ),
-    "bounds of too many": (control(u_min=(-1, -1), u_max=(1, 1)), ["u_min"]),
-    "a problem that is none": (field(control={"horizon": 10}), ["control: must be OCP(...)"]),
-    "a field there is not": (control(horizn=9), ["'horizn'; did you mean 'horizon'?"]),
-    "no sensor_sigma": (field(sensor_sigma=()), ["sensor_sigma: must have 1 numbers, got 0"]),
-    "zero sensor_sigma": (field(sensor_sigma=(0.0,)), ["HM-CHECK-020"]),
-    "NaN sensor_sigma": (field(sensor_sigma=(math.nan,)), ["sensor_sigma[0]"]),
-    "absurd sensor_sigma": (field(sensor_sigma=(1e300,)), ["sensor_sigma[0]"]),
-    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), ["HM-KIT-015", "(phi_dot)"]),
-    "noise of no state": (field(state_noise={"phi_dott": 0.1}), ["state_noise: no state 'phi_dott'", "phi_dot"]),
-    "zero state_noise": (field(state_noise={"phi": 0.0}), ["HM-CHECK-022"]),
-    "zero du_max": (control(du_max=(0,)), ["du_max"]),
-    "crossed states": (control(x_min=(1, -1), x_max=(-1, 1)), ["HM-CONTROL-051"]),
-    "hard bounds of too many outputs": (
-        control(hard=[HardBound("y", (-1.0,) * 3, (1.0,) * 3)]), ["HM-CONTROL-037"]
-    ),
+    "weights of too few": (field(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), "HM-CHECK-023"),
+    "a problem that is none": (field(control={"horizon": 10}), "HM-SCENARIO-002"),
+    "no sensor_sigma": (field(sensor_sigma=()), "HM-CHECK-019"),
+    "zero sensor_sigma": (field(sensor_sigma=(0.0,)), "HM-CHECK-020"),
+    "absurd sensor_sigma": (field(sensor_sigma=(1e300,)), "HM-RECORDS-007"),
+    "first_sigma of all": (field(first_sigma=(1e-3, 0.1)), "HM-KIT-015"),
+    "noise of no state": (field(state_noise={"phi_dott": 0.1}), "HM-CHECK-021"),
+    "zero state_noise": (field(state_noise={"phi": 0.0}), "HM-CHECK-022"),
+    "hard bounds of too many outputs": (control(hard=[HardBound("y", (-1.0,) * 3, (1.0,) * 3)]), "HM-CONTROL-037"),
     "hard bound out of reach": (
         control(hard=[HardBound(ca.Function("one", [ca.SX.sym("x", 2), ca.SX.sym("u")], [ca.SX(1)]), [0.0], [2.0])]),
-        ["hard bound on one", "HM-CONTROL-030"],
+        "HM-CONTROL-030",
     ),
-    "working point of one": (control(working_point=((0.0,), (0.0,))), ["HM-MODEL-017"]),
-    "starts of another shape": (control(starts=(((0.0,),),)), ["HM-CONTROL-024", "(10, 1)"]),
     # tasks
-    "no reference for all": (task(reference=lambda t: np.zeros((len(t), 1))), ["task hold: reference", "(50, 2)"]),
-    "reference that raises": (task(reference=raises), ["task hold raised KeyError"]),
-    "reference of NaN": (task(reference=lambda t: np.full((len(t), 2), np.nan)), ["HM-CHECK-029", "finite"]),
-    "negative factors": (task(weight=lambda t: -np.ones((len(t), 2))), ["HM-CHECK-030"]),
-    "no duration": (task(duration=0.0), ["task 'hold': duration"]),
-    "endless": (task(duration=math.inf), ["task 'hold': duration"]),
-    "x0 of one": (task(x0=(0.0,)), ["x0 must have 2"]),
-    "x0 of NaN": (task(x0=(math.nan, 0.0)), ["x0[0]"]),
-    "task's own weights": (
-        task(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), ["control of task hold: q must have 2 numbers"]
-    ),
-    "same tasks": (field(tasks=(TASK, TASK)), ["'hold' appears twice"]),
-    "fault of a channel": (
-        task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), ["HM-LOOP-004"],
-    ),
-    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), ["HM-LOOP-006"]),
-    "tasks without control": (field(control=None), ["no control problem"]),
+    "no reference for all": (task(reference=lambda t: np.zeros((len(t), 1))), "HM-CHECK-059"),
+    "reference that raises": (task(reference=raises), "HM-CHECK-061"),
+    "reference of NaN": (task(reference=lambda t: np.full((len(t), 2), np.nan)), "HM-CHECK-029"),
+    "negative factors": (task(weight=lambda t: -np.ones((len(t), 2))), "HM-CHECK-030"),
+    "no duration": (task(duration=0.0), "HM-RECORDS-007"),
+    "x0 of one": (task(x0=(0.0,)), "HM-CHECK-027"),
+    "x0 of NaN": (task(x0=(math.nan, 0.0)), "HM-RECORDS-007"),
+    "same tasks": (field(tasks=(TASK, TASK)), "HM-RECORDS-004"),
+    "fault of a channel": (task(faults=(Fault(0, 1, "input_gain", 0.5, channel="third"),)), "HM-LOOP-004"),
+    "fault the plant lacks": (task(faults=(Fault(0, 1, "plant_fire", 0.5),)), "HM-LOOP-006"),
+    "tasks without control": (field(control=None), "HM-CHECK-018"),
     # plant and oracle
-    "plant that raises": (plant(step=raises), ["plant raised KeyError"]),
-    "plant measures all": (plant(measure=lambda self, state, rng: state), ["measure: must return", "(1,)"]),
-    "plant tells less": (plant(truth=lambda self, state: state[:1]), ["truth: must return", "(2,)"]),
-    "plant of NaN": (plant(step=lambda self, s, u, dt: s * np.nan), ["must return finite numbers"]),
-    "oracle that raises": (field(oracle=raises), ["oracle raised KeyError"]),
+    "plant that raises": (plant(step=raises), "HM-CHECK-061"),
+    "plant measures all": (plant(measure=lambda self, state, rng: state), "HM-CHECK-025"),
+    "plant of NaN": (plant(step=lambda self, s, u, dt: s * np.nan), "HM-CHECK-026"),
+    "oracle that raises": (field(oracle=raises), "HM-CHECK-061"),
     # budgets
-    "no networks": (budget(networks=0), ["budget: networks"]),
-    "half a unit": (budget(hidden=2.5), ["budget: hidden"]),
-    "negative decay": (budget(decay=-1.0), ["budget: decay"]),
+    "no networks": (budget(networks=0), "HM-RECORDS-007"),
+    "half a unit": (budget(hidden=2.5), "HM-RECORDS-006"),
 }  # fmt: skip
 
 
-ALSO_IN_TORCH = ("no tuple", "NaN", "output raises", "negative loss", "operating point of numbers")
+ALSO_IN_TORCH = ("no such parameter", "NaN", "output raises", "negative loss", "operating point of numbers")
 """Of each kind one; torch takes half a second to trace a prior, so the full set has the others."""
 
 
@@ -354,11 +292,9 @@ ALSO_IN_TORCH = ("no tuple", "NaN", "output raises", "negative loss", "operating
     ],
 )
 def test_every_wrong_prior_is_told_in_both_ways_of_writing(name, base):
-    make, words = IN_BOTH[name]
-    with pytest.raises(InputError) as told:
+    make, code = IN_BOTH[name]
+    with pytest.raises(InputError, match=code):
         check_scenario(changed(base, make(ca if base is Tank else torch)))
-    for word in words:
-        assert word in str(told.value)
 
 
 def changed(base, members):
@@ -413,14 +349,11 @@ def test_what_one_way_of_writing_cannot_do_is_told(base, rate, words):
         assert word in str(told.value)
 
 
-@pytest.mark.parametrize("changes", [v for v, _ in WRONG.values()], ids=WRONG)
+@pytest.mark.parametrize(("changes", "code"), WRONG.values(), ids=WRONG)
 @pytest.mark.full
-def test_every_wrong_scenario_is_told(changes):
-    words = next(w for v, w in WRONG.values() if v is changes)
-    with pytest.raises(InputError) as told:
+def test_every_wrong_scenario_is_told(changes, code):
+    with pytest.raises(InputError, match=code):
         check_scenario(dataclasses.replace(GOOD, **changes()))
-    for word in words:
-        assert word in str(told.value)
 
 
 def test_all_problems_are_told_at_once():

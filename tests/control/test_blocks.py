@@ -1,7 +1,5 @@
 """Move blocking: every solver finds the same plan, and holds its inputs."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from control_parts import estimate_of, pendulum_problem, plan_of
@@ -9,7 +7,7 @@ from lq_oracle import states
 from online_models import pendulum_model, random_linear
 from scipy.optimize import minimize
 
-from hybrid_mpc import OCP, CondensedController, IpoptController, SafeController, SQPController, Status
+from hybrid_mpc import OCP, CondensedController, IpoptController, SQPController, Status
 
 BLOCKS = (1, 1, 2, 3, 5, 8)
 
@@ -54,17 +52,3 @@ def test_a_linear_problem_by_an_independent_minimiser():
     # L-BFGS-B differentiates numerically: 1e-8 of the slope, over a condition of some tens.
     np.testing.assert_allclose(plan.u, np.repeat(want.x.reshape(3, 2), (1, 2, 5), axis=0), atol=1e-5)
     assert plan.cost == pytest.approx(want.fun, rel=1e-9)
-
-
-def test_a_closed_loop_of_held_inputs_arrives():
-    model = pendulum_model(z=3)
-    controller = SafeController(CondensedController(model, pendulum_problem(20, blocks=BLOCKS)))
-    e = estimate_of(model, [-0.5, 0.0])
-    decision = controller.initial(e)
-    for _ in range(150):
-        decision = controller.decide(decision, e, np.zeros((1, 2)))
-        assert decision.solution.status.ok
-        assert is_held(decision.solution.u)
-        x, h = (v.full().ravel() for v in model.step(e.x, e.h, decision.u, model.w, model.p))
-        e = replace(e, x=x, h=h)
-    assert np.max(np.abs(e.x)) < 0.02  # within friction and the network's own torque

@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from control_parts import estimate_of, pendulum_problem, plan_of
-from lq_oracle import constraints, residuals, states
 from online_models import linear_model, pendulum_model
 from scipy.optimize import linprog
 
@@ -32,40 +31,6 @@ SOLVERS = [lambda m, o: CondensedController(m, o, iterations=30), SQPController,
 
 def problem(*hard, horizon=25, **others):
     return OCP(horizon, [10.0, 0.1], [0.01], [0.0], [-3.0], [3.0], hard=hard, **others)
-
-
-def oracle(ocp, z, lower, upper):
-    """The plan under hard bounds on states, by IPOPT over the inputs."""
-    n, none, terminal = ocp.horizon, np.zeros(1), ocp.terminal_weight(MODEL)
-    f = lambda u: residuals(u.reshape(n, 1), A, B, ocp, DT, terminal, z, 0.0, np.tile(GOAL, (n + 1, 1)), none)  # noqa: E731
-    x = lambda u: states(u.reshape(n, 1), A, B, ocp, z, 0.0).ravel()  # noqa: E731
-    r0, x0 = f(np.zeros(n)), x(np.zeros(n))
-    m, by_u = (np.stack([g(e) - g0 for e in np.eye(n)], axis=1) for g, g0 in ((f, r0), (x, x0)))
-    opti = ca.Opti()
-    u = opti.variable(n)
-    opti.minimize(ca.sumsqr(m @ u + r0))
-    g, h = constraints(ocp, none)
-    opti.subject_to(g @ u <= h)
-    for bound, sign in ((upper, 1), (lower, -1)):
-        rows = np.flatnonzero(np.isfinite(np.tile(bound, n)))
-        opti.subject_to(sign * (x0[rows] + by_u[rows] @ u - np.tile(bound, n)[rows]) <= 0)
-    opti.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes", "tol": 1e-12})
-    answer = opti.solve()
-    return answer.value(u), answer.value(opti.f)
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_linear_problem_is_solved_as_by_ipopt_over_the_inputs(solver):
-    lower, upper = np.array([-np.inf, -0.5]), np.array([0.8, 0.6])
-    ocp, z = problem(HardBound("x", lower, upper)), np.array([-0.3, 0.2])
-    want, cost = oracle(ocp, z, lower, upper)
-    plan = plan_of(solver(MODEL, ocp), estimate_of(MODEL, z), GOAL)
-    assert plan.status is Status.SOLVED
-    assert dict(plan.given_way) == {}
-    assert plan.cost == pytest.approx(cost, rel=1e-6)  # IPOPT relaxes bounds by 1e-8
-    np.testing.assert_allclose(plan.u[:, 0], want, atol=1e-4)  # the cost is flat: the root of its tolerance
-    assert np.max(plan.x[:, 0]) == pytest.approx(0.8, abs=1e-6)  # both bounds act
-    assert np.max(plan.x[:, 1]) == pytest.approx(0.6, abs=1e-6)
 
 
 def test_whatever_it_costs_a_bound_that_can_be_kept_is_kept():

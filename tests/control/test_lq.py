@@ -5,8 +5,6 @@ import pytest
 from control_parts import estimate_of, linear_problem, plan_of
 from lq_oracle import constraints, lq_plan, residuals
 from online_models import linear_model, random_linear
-from scipy.linalg import block_diag
-from scipy.optimize import minimize
 
 from hybrid_mpc import OCP, CondensedController, InputError, IpoptController, SQPController, Status, dare
 
@@ -25,19 +23,6 @@ def test_the_whole_plan_is_the_lqr(n_u, radius):
         np.testing.assert_allclose(plan.u[j], -k @ z, atol=1e-8)  # rounding, cond(H) about 1e4
         np.testing.assert_allclose(plan.x[j], z, atol=1e-8)
         z = (a - b @ k) @ z
-
-
-@pytest.mark.parametrize("n_u", [1, 2])
-def test_first_input_with_a_linear_hidden_state_is_the_lqr(n_u):
-    model, a, b, _ = random_linear(1, n_u=n_u, n_h=3, radius=0.8)
-    controller = CondensedController(model, linear_problem(n_u, 60))
-    q = block_diag(np.diag(controller.ocp.q), np.zeros((3, 3)))
-    _, k = dare(a, b, q, np.diag(controller.ocp.r))
-    # The terminal weight leaves h out, which the first input feels with the square of the closed loop's decay.
-    assert np.max(np.abs(np.linalg.eigvals(a - b @ k))) ** (2 * 60) < 1e-9
-    z = np.random.default_rng(0).normal(size=6)
-    plan = plan_of(controller, estimate_of(model, z), np.zeros((1, 3)))
-    np.testing.assert_allclose(plan.u[0], -k @ z, atol=1e-8)
 
 
 @pytest.mark.parametrize("n_h", [0, 2])
@@ -121,28 +106,6 @@ def test_a_disturbance_that_has_changed_since_the_last_plan(n_h):
     assert np.max(np.abs(got.u - lq_plan(*args, before, reference, plan.u[0]))) > 0.1
 
 
-def test_the_oracle_agrees_with_slsqp():
-    model, a, b, _ = random_linear(2, n_u=1, radius=1.05)
-    ocp = linear_problem(1, 6, bound=0.5, du_max=0.15)
-    rng = np.random.default_rng(2)
-    args = (a, b, ocp, model.dt, ocp.terminal_weight(model), rng.normal(size=3), np.zeros(1),
-            rng.normal(size=(7, 3)), np.array([0.2]))  # fmt: skip
-    g, h = constraints(ocp, args[-1])
-    cost = lambda u: np.sum(residuals(u.reshape(6, 1), *args) ** 2)  # noqa: E731
-    rows = {"type": "ineq", "fun": lambda u: h - g @ u}
-    options = {"ftol": 1e-14, "maxiter": 300}
-    got = minimize(cost, np.full(6, 0.2), method="SLSQP", constraints=rows, options=options)
-    np.testing.assert_allclose(lq_plan(*args).ravel(), got.x, atol=1e-5)  # SLSQP's numerical gradients
-
-
-def test_on_a_linear_model_the_first_guess_does_not_matter():
-    model, *_ = random_linear(4, n_u=1, n_h=2)
-    controller = CondensedController(model, linear_problem(1, 10, bound=0.5))
-    e, start = estimate_of(model, [1.0, -1.0, 0.5, 0.2, 0.1]), np.full((10, 1), 0.3)
-    u = plan_of(controller, e, np.zeros((1, 3)), start=start).u
-    np.testing.assert_allclose(u, plan_of(controller, e, np.zeros((1, 3))).u, atol=1e-8)  # rounding
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -173,8 +136,8 @@ def test_bad_input_is_refused(change, words):
 
 @pytest.mark.parametrize(
     "limits",
-    [(-1, 2), (0, 2), (-2, 0), (0.5, 2), (-2, -0.5),
-     (-0.5, INF), (-INF, 0.5), (0, INF), (-INF, 0), (0.5, INF), (-INF, INF)],
+    [(0.5, 2), (-2, 0), (-0.5, INF), (-INF, -0.5), (-INF, INF),
+     *(pytest.param(one, marks=pytest.mark.full) for one in ((-1, 2), (0, 2), (-2, -0.5), (0, INF), (0.5, INF)))],
     ids=str,
 )  # fmt: skip
 @pytest.mark.parametrize(

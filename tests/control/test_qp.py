@@ -83,8 +83,3 @@ def test_an_ill_conditioned_problem_keeps_its_bounds():
         assert answer.status is Status.SOLVED
         # rounding times the Hessian's condition of 1e8
         assert np.max(np.abs(answer.step)) <= 1 + 1e-7
-
-
-def test_messages_and_ok():
-    assert [status for status in Status if status.ok] == [Status.SOLVED, Status.STOPPED]
-    assert len({status.value for status in Status}) == len(Status)

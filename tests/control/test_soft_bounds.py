@@ -3,9 +3,9 @@
 import casadi as ca
 import numpy as np
 import pytest
-from control_parts import estimate_of, pendulum_problem, plan_of
+from control_parts import estimate_of, plan_of
 from lq_oracle import soft_plan, states
-from online_models import linear_model, pendulum_model, random_linear
+from online_models import linear_model, random_linear
 
 from hybrid_mpc import OCP, CondensedController, InputError, SoftBound, Status
 from hybrid_mpc.control.problem import BoundRows
@@ -68,25 +68,6 @@ def test_a_bound_that_can_be_kept_is_kept_exactly():
     np.testing.assert_allclose(again.u, got.u, atol=2e-5)
 
 
-def test_a_bound_that_cannot_be_kept_is_approached_as_fast_as_possible():
-    model, ocp = double_integrator(x_max=[0.5, np.inf])
-    got = solve(model, ocp, np.array([0.6, 1.0]), np.zeros((1, 2)))
-    assert got.status is Status.SOLVED
-    brake = np.array([0.6, 1.0])
-    for k in range(1, 4):  # full braking is what keeps the violation smallest
-        brake = A @ brake + B @ [-3.0]
-        np.testing.assert_allclose(got.x[k], brake, atol=1e-5)
-    assert got.excess == pytest.approx(np.max(got.x[1:, 0]) - 0.5, abs=1e-5)
-
-
-def test_bounds_that_do_not_act_change_nothing():
-    model, free = double_integrator()
-    _, wide = double_integrator(x_min=[-9.0, -9.0], x_max=[9.0, 9.0])
-    plans = [solve(model, ocp, np.array([1.0, 0.0]), np.zeros((1, 2))) for ocp in (free, wide)]
-    np.testing.assert_array_equal(plans[0].u, plans[1].u)  # the same QP, without slacks
-    assert plans[0].cost == plans[1].cost
-
-
 def test_expression_that_is_a_state_or_an_input_bounds_it():
     x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
     z, reference = np.zeros(2), np.tile([1.0, 0.0], (31, 1))
@@ -124,18 +105,6 @@ def test_derivatives_of_expressions_are_those_of_finite_differences():
     want = np.sum(by_x * dx[rows.stage], axis=1) + np.sum(by_u * inputs, axis=1)
     np.testing.assert_allclose(change, want, atol=1e-8)  # central differences, rounding of 1e-16 / 1e-6
     np.testing.assert_array_equal(value[:3], xs[1:, 1])
-
-
-def test_a_nonlinear_model_keeps_its_bounds_when_iterated():
-    model = pendulum_model(z=3)
-    ocp = pendulum_problem(40, 3.0, 0.1, x_max=[0.3, 1.2], x_min=[-np.inf, -1.2])
-    controller, e = CondensedController(model, ocp, iterations=30), estimate_of(model, [-0.3, 0.0])
-    plan = plan_of(controller, e, np.array([[0.5, 0.0]]))
-    assert plan.status is Status.SOLVED
-    run = controller.problem.run(np.concatenate([e.x, e.h]), plan.u)
-    # the model's own run keeps them too, to the defects of the last iteration
-    assert np.max(run[:, 0]) == pytest.approx(0.3, abs=1e-5)
-    assert np.max(run[:, 1]) == pytest.approx(1.2, abs=1e-5)
 
 
 @pytest.mark.parametrize(

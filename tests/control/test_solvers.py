@@ -50,7 +50,7 @@ def compare(seed):
     return bool(any(acts) or (ocp.du_max is not None and np.max(change) > 0.999 * ocp.du_max[0]))
 
 
-@pytest.mark.parametrize(("count", "acting"), [(20, 6), pytest.param(100, 30, marks=pytest.mark.full)])
+@pytest.mark.parametrize(("count", "acting"), [(8, 2), pytest.param(100, 30, marks=pytest.mark.full)])
 def test_sqp_is_as_good_as_ipopt(count, acting):
     assert sum(compare(seed) for seed in range(count)) >= acting
 

@@ -10,7 +10,6 @@ from scipy.io import savemat
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.excitation import check_excitation
-from hybrid_mpc.data.names import name_and_unit
 from hybrid_mpc.data.recording import censored_of, read_recording
 from hybrid_mpc.data.scales import noise_of, time_scale
 from hybrid_mpc.data.trajectories import ROLES, Trajectory, line_mean, to_grid
@@ -237,13 +236,6 @@ def test_wrapped_angles_with_holes_count_on(tmp_path):
     assert sorted(f.kind for f in recording.findings) == ["missing", "wrapped"]
 
 
-def test_frozen_sensors_are_found_beside_holes(tmp_path):
-    y = GOOD["y"].copy()
-    y[300:360] = y[300]
-    data = read(wrote(tmp_path, y=blank(y, np.arange(600) % 9 == 4)))
-    assert sorted(f.kind for f in data.findings) == ["frozen", "missing"]
-
-
 def test_scales_and_excitation_of_slow_outputs():
     t = 0.02 * np.arange(20_000)
     rng = np.random.default_rng(0)
@@ -300,17 +292,6 @@ def test_between_a_measured_and_a_censored_sample_the_grid_has_a_bound():
     np.testing.assert_array_equal(
         values, [0.5, 0.75, 1, 1, 1, np.nan, -1, -0.5, 0, 0.5, 1]
     )  # from end to end: unknown
-
-
-def test_smoothing_leaves_clipped_samples_out(tmp_path):
-    exact = np.sin(2 * T)
-    states = (CLIPPED, Signal("v", "m/s"))
-    (whole,) = read(wrote(tmp_path, y=np.clip(exact, -0.5, 0.7)), outputs=(CLIPPED,), states=states).whole
-    known = np.isfinite(whole.x[:, 0])
-    assert 0.3 < known.mean() < 0.7
-    np.testing.assert_allclose(
-        whole.x[known], np.c_[np.sin(2 * whole.t), 2 * np.cos(2 * whole.t)][known], atol=2e-3
-    )
 
 
 def test_what_is_no_range_of_a_sensor():
@@ -435,11 +416,6 @@ def test_counts_of_columns_name_the_signals(tmp_path):
     assert "inputs_of 'x' has 2 columns ('a', 'b') for a prior with 0 inputs" in told[2]
 
 
-def test_a_machine_without_inputs(tmp_path):
-    (whole,) = read(wrote(tmp_path), replace(SPEC, inputs=()), inputs=()).whole
-    assert whole.u.shape == (len(whole.t), 0)
-
-
 def test_outputs_that_are_no_positions_have_no_states_yet(tmp_path):
     file = wrote(tmp_path)
     rough = replace(SPEC, smoothing=0.02)  # too few samples for a polynomial, and none is needed
@@ -535,13 +511,6 @@ def test_units_in_brackets_are_those_of_their_signals(tmp_path):
     assert "'y [kg]' is in 'kg'" in told
     factor = replace(SPEC, units={"y": 2.0})
     np.testing.assert_allclose(read(tmp_path / "run.csv", factor).whole[0].y, 2 * plain.y, atol=1e-9)
-
-
-def test_names_and_units():
-    assert name_and_unit("tau [N m]") == ("tau", "N m")
-    assert name_and_unit("f(x) [1/s]") == ("f(x)", "1/s")
-    assert name_and_unit("[m]") == ("[m]", "")
-    assert name_and_unit("a]") == ("a]", "")
 
 
 def test_a_period_far_finer_than_the_sampling_is_refused(tmp_path):

@@ -57,16 +57,6 @@ def test_the_cutoff_is_where_the_value_has_lost_3_db(method, cutoff, dt):
     assert method(cutoff).bandwidth(dt) == pytest.approx(cutoff, abs=step)
 
 
-def test_spline_is_the_gain_of_theory():
-    m, f = SmoothingSpline(6.0), np.linspace(0.5, 45.0, 30)
-    w = 2 * np.pi * f * DT
-    b, d, w_c = (4 + 2 * np.cos(w)) / 6, 2 - 2 * np.cos(w), 2 * np.pi * 6.0 * DT
-    lam = (np.sqrt(2) - 1) * (4 + 2 * np.cos(w_c)) / 6 / (2 - 2 * np.cos(w_c)) ** 2
-    for derivative, exact in enumerate((b, np.sin(w) / w, d / w**2)):
-        theory = exact / (b + lam * d**2)
-        np.testing.assert_allclose(m.response(f, DT, derivative), theory, atol=1e-8)
-
-
 def test_the_local_polynomial_is_exact_on_quartics_up_to_the_ends():
     t = np.arange(100) * DT
     d = differentiate(t**4 - t, DT, LocalPolynomial(0.2))
@@ -94,20 +84,11 @@ def test_the_causal_polynomial_is_exact_on_quadratics_late_by_its_lag_and_knows_
 
 @pytest.mark.parametrize("derivative", [0, 1, 2])
 def test_noise_comes_through_as_said(method, derivative):
-    noise = np.random.default_rng(2).standard_normal(60_000)
+    noise = np.random.default_rng(2).standard_normal(20_000)
     got = np.nanstd(parts(differentiate(noise, DT, method))[derivative])
-    # values of neighbours depend on each other over about 20 samples: 60000 / 20 independent ones scatter by
-    # 1 / sqrt(2 * 3000) = 1.3 %; 4 sigma
-    assert got == pytest.approx(method.noise_gain(DT, derivative), rel=0.052)
-
-
-def test_columns_are_independent(method):
-    y = np.random.default_rng(3).standard_normal((200, 2))
-    both = parts(differentiate(y, DT, method))
-    for j in range(2):
-        for one, two in zip(both, parts(differentiate(y[:, j], DT, method)), strict=True):
-            assert one.shape == (200, 2)
-            np.testing.assert_allclose(one[:, j], two, rtol=1e-9, atol=1e-9)
+    # values of neighbours depend on each other over about 20 samples: 20000 / 20 independent ones scatter by
+    # 1 / sqrt(2 * 1000) = 2.2 %; 4 sigma
+    assert got == pytest.approx(method.noise_gain(DT, derivative), rel=0.09)
 
 
 def test_straight_lines_pass_up_to_the_ends(method):

@@ -9,7 +9,7 @@ from recording_bombs import GOOD, SPEC, T
 
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.findings import find_folding
-from hybrid_mpc.data.recording import make_even, read_recording
+from hybrid_mpc.data.recording import read_recording
 
 FREE = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
 PLAIN = machine((Signal("n", "rpm"),), (Signal("u", "V"),))
@@ -183,14 +183,6 @@ def test_time_in_single_precision_is_even_again(tmp_path, begin, dt):
     )
 
 
-def test_stamps_that_are_uneven_stay_so():
-    rng = np.random.default_rng(0)
-    t = 0.01 * np.arange(500)
-    for stamps in (t, t + 1e-3 * rng.random(500), np.round(t + 2e-3 * rng.random(500), 3), t**1.5, 1.7e9 + t):
-        assert make_even(stamps) is stamps or np.array_equal(make_even(stamps), stamps)
-    np.testing.assert_allclose(np.diff(make_even(np.round(0.0025 * np.arange(500), 3))), 0.0025, rtol=1e-3)
-
-
 @pytest.mark.parametrize("parts", [2, 3, 4])
 @pytest.mark.parametrize("speed", [0.4, 3.0, -3.0])
 def test_an_angle_that_begins_anew_after_a_part_of_a_turn_is_refused(tmp_path, parts, speed):
@@ -280,11 +272,6 @@ def test_a_column_without_a_number_is_refused_whatever_its_unit(tmp_path):
 )
 def test_settings_of_nothing_are_refused(tmp_path, setting, match):
     refused(tmp_path / "run.npz", GOOD, match, spec=replace(SPEC, **setting))
-
-
-def test_settings_of_recordings_that_are_not_given_are_not(tmp_path):
-    spec = replace(SPEC, windows={"monday": (Window(0, 0.3, "train"),)}, delays_of={"tuesday": {"phi": 0.1}})
-    assert len(read(tmp_path / "run.npz", GOOD, spec=spec).t) == 60
 
 
 @pytest.mark.parametrize("ends", [(-8.0, -7.5), (7.0, 9.0), (-1e-3, -5e-4), (0.9, 1.1)])

@@ -97,10 +97,10 @@ def tried(path, seed):
     return True
 
 
-def test_a_hundred_tables(tmp_path):
-    assert np.mean([tried(tmp_path / "run.csv", seed) for seed in range(100)]) > 0.9
+def test_thirty_tables(tmp_path):
+    assert np.mean([tried(tmp_path / "run.csv", seed) for seed in range(30)]) > 0.85
 
 
 @pytest.mark.full
 def test_two_thousand_tables(tmp_path):
-    assert np.mean([tried(tmp_path / "run.csv", seed) for seed in range(100, 2100)]) > 0.95
+    assert np.mean([tried(tmp_path / "run.csv", seed) for seed in range(30, 2030)]) > 0.95

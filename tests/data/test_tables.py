@@ -238,23 +238,6 @@ def test_clocks_of_their_own_meet_by_the_rules_of_their_roles(wrote):
     assert np.isnan(y[~sampled]).all()
 
 
-def test_clocks_that_differ_by_rounding_are_one(wrote):
-    rows = [[repr(0.1 * k), "u", f"{k}"] for k in range(40)] + [
-        [repr(0.1 * k + 1e-12), "y", f"{k}"] for k in range(40)
-    ]
-    rows += [[repr(0.1 * 39 + 1e-12), "y", "39"]]  # stands twice
-    columns = opened(wrote(text(rows, header=("time", "tag", "value")))).read("time", ["u", "y"], ["y"])
-    np.testing.assert_array_equal(columns.values, np.c_[0.1 * K, K, K])
-
-
-def test_one_sensor_a_row(wrote):
-    rows = [[f"{k}", f"s{k % 2}", f"{k / 4}", f"{k / 8}"] for k in range(20)]
-    source = opened(wrote(text(rows, header=("time", "sensor", "temp", "level"))))
-    assert source.header == ("time", "s0.temp", "s0.level", "s1.temp", "s1.level")
-    columns = source.read("time", ["s1.level"], ["s1.level"])
-    np.testing.assert_array_equal(columns.values, np.c_[np.arange(1, 20, 2), np.arange(1, 20, 2) / 8])
-
-
 def test_a_signal_is_no_tag(wrote):
     """A column of numbers that is called a signal, and words that do not repeat, name no signals."""
     path = wrote(
@@ -328,13 +311,6 @@ def test_what_is_ambiguous_is_refused_in_a_line(wrote, kind):
             raise InputError(f"{path}: {columns.problems[0]}")
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(path))
-
-
-def test_what_was_done_is_said(wrote):
-    source = opened(wrote(text(GERMAN, ";", above=["Logger", "Nr 5"], below=["Mittel;1;2"])))
-    told = "; ".join(source.notes)
-    for words in ("rows 1 to 2 are a preamble; header in row 3", "decimal comma", "row", "44"):
-        assert words in told
 
 
 # Time

@@ -9,7 +9,7 @@ from scipy.io import savemat
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.excitation import short_runs
 from hybrid_mpc.data.recording import check_unit, read_recording
-from hybrid_mpc.data.trajectories import Trajectory, hold_mean
+from hybrid_mpc.data.trajectories import Trajectory
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
@@ -29,16 +29,6 @@ def test_states_and_derivatives_of_a_known_motion(tmp_path):
     np.testing.assert_allclose(whole.xdot[inner, 1], -np.sin(whole.t)[inner], atol=2.5e-3)
     np.testing.assert_allclose(np.diff(whole.t), SPEC.dt, atol=1e-12)
     assert [piece.role for piece in data.trajectories] == ["train", "valid", "test"]
-
-
-def test_hold_mean_keeps_the_impulse():
-    rng = np.random.default_rng(2)
-    t = np.cumsum(rng.uniform(0.001, 0.009, 400))
-    u = rng.standard_normal((400, 2))
-    dt = 0.02
-    grid = t[0] + dt * np.arange(int((t[-1] - t[0]) / dt) + 1)  # the last period ends after the record
-    impulse = (u[:-1] * np.diff(t)[:, None]).sum(axis=0)
-    np.testing.assert_allclose(hold_mean(t, u, grid, dt).sum(axis=0) * dt, impulse, atol=1e-12)
 
 
 def test_gap_cuts_and_nothing_leaks_across_it(tmp_path):
@@ -152,15 +142,6 @@ def test_the_main_job_reads_mat_files(tmp_path):
     data = Context(settings, load_scenario("golf_robot"), tmp_path).dataset
     assert data.files == ("mine.mat",)
     np.testing.assert_allclose(data.whole[0].y[:, 0], np.sin(data.whole[0].t), atol=1e-12)
-
-
-def test_roles_that_are_not_needed_may_be_empty(tmp_path):
-    file = record(tmp_path / "run.csv", 0.01 * np.arange(1000))
-    spec = replace(SPEC, fractions=(0.75, 0.25, 0.0))
-    with pytest.raises(InputError, match=r"test.*HM-DATA-114"):
-        load_trajectories([file], SIGNALS, spec)
-    data = load_trajectories([file], SIGNALS, spec, needed=("train", "valid"))
-    assert [piece.role for piece in data.trajectories] == ["train", "valid"]
 
 
 def test_too_short_a_recording_is_told_how_long_one_must_be(tmp_path):

@@ -55,18 +55,6 @@ def test_it_is_the_exact_filter_of_the_delayed_system(sensor_delay, input_delay)
     assert e.filtered.t == pytest.approx((29 - sensor_delay) * model.dt)
 
 
-def test_without_delays_it_is_the_estimator_itself():
-    model = pendulum_model(z=3)
-    ekf = make_filter(model)
-    plain, wrapped = ekf.start([0.3]), DelayCompensation(ekf).start([0.3])
-    for y, u in ((0.31, 0.2), (np.nan, -0.4), (0.28, 0.1)):
-        plain = ekf.update(plain, [y], [u])
-        wrapped = DelayCompensation(ekf).update(wrapped, [y], [u])
-    np.testing.assert_array_equal(wrapped.x, plain.x)
-    np.testing.assert_array_equal(wrapped.h, plain.h)
-    np.testing.assert_array_equal(wrapped.P, plain.P)
-
-
 def test_an_oracle_predicts_with_its_model():
     model = pendulum_model(z=3)
     ahead = DelayCompensation(TrueState(model), input_delay=2)

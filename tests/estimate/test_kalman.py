@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from online_models import PendulumPlant, linear_model, make_filter, pendulum_model, random_linear
+from online_models import linear_model, make_filter, pendulum_model, random_linear
 
 from hybrid_mpc import ExtendedKalmanFilter, InputError, TrueState
 from hybrid_mpc.estimate.kalman import START_LIMIT
@@ -73,31 +73,6 @@ def test_partly_missing_measurement_uses_the_rest():
     got, want = both.correct(predicted, [0.4, np.nan]), one.correct(predicted, [0.4])
     np.testing.assert_allclose(got.x, want.x, atol=1e-14)  # the same arithmetic
     assert np.isnan(got.innovation[1])
-
-
-def test_methods_are_pure():
-    ekf = make_filter(pendulum_model(z=4))
-    e = ekf.start([0.3])
-    p = e.P.copy()
-    first, second = ekf.update(e, [0.31], [0.2]), ekf.update(e, [0.31], [0.2])
-    np.testing.assert_array_equal(first.x, second.x)
-    np.testing.assert_array_equal(e.P, p)
-
-
-def test_constant_input_disturbance_is_found():
-    model = pendulum_model()
-    parameters = {"gravity": 2.4, "damping": 0.02, "friction": 0.05}
-    plant = PendulumPlant(noise=1e-3, disturbance=0.25, **parameters)
-    ekf = make_filter(model, sigma_y=[1e-3], sigma_x=[1e-4, 1e-3], sigma_d=[2e-3], sigma_x0=[1e-2, 0.1])
-    rng, state = np.random.default_rng(0), plant.reset([0.0, 0.0], 0)
-    e, ds = ekf.start([0.0]), []
-    for k in range(400):
-        u = np.array([0.8 * np.sin(0.08 * k)])
-        state = plant.step(state, u, 0.02)
-        e = ekf.update(e, plant.measure(state, rng), u)
-        ds.append(e.d[0])
-    # The plant's inertia is 14 % larger and its friction steeper: d carries that too, on average little.
-    assert abs(np.mean(ds[100:]) - 0.25) < 0.03
 
 
 def test_without_deviations_of_d_there_is_no_disturbance_observer():

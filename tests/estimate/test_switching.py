@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from online_models import linear_model, pendulum_model, random_linear
 
-from hybrid_mpc import DelayCompensation, ExtendedKalmanFilter, InputError, SwitchingFilter
+from hybrid_mpc import ExtendedKalmanFilter, InputError, SwitchingFilter
 
 TWO = [[0.99, 0.01], [0.5, 0.5]]
 
@@ -118,15 +118,6 @@ def test_a_lost_filter_starts_anew():
         after = switching.update(after, np.array([0.2]), np.zeros(1))
     assert np.all(np.isfinite(after.x))
     assert abs(after.x[0] - 0.2) < 0.05
-
-
-def test_delays_are_compensated_on_it_too(integrator):
-    switching = SwitchingFilter([filter_of(integrator, 0.0), filter_of(integrator, 1.0)], TWO)
-    ahead = DelayCompensation(switching, sensor_delay=1, input_delay=1)
-    estimate = ahead.start(np.array([0.1]))
-    for k in range(5):
-        estimate = ahead.update(estimate, np.array([0.1]), np.array([0.01 * k]))
-    assert estimate.t == pytest.approx(6 * integrator.dt)  # five updates and the input's delay
 
 
 def test_bad_input_is_refused(integrator):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise
+from hybrid_mpc import ExtendedKalmanFilter, HybridModel, InputError, Signal, process_noise, with_input_delay
 from hybrid_mpc.estimate.tuning import (
     _error,
     _left,
@@ -84,6 +84,16 @@ def test_process_noise_is_the_error_of_one_period():
     assert np.array_equal(process_noise(model, [half, half], most=50), process_noise(model, [half]))
     with pytest.raises(InputError, match="HM-ESTIMATE-022"):
         process_noise(model, [])
+
+
+def test_process_noise_leaves_out_periods_whose_delayed_inputs_are_unknown():
+    rng, n, late = np.random.default_rng(3), 30, 2
+    u, x = rng.normal(size=(n, 1)), np.zeros((n, 2))
+    acting = np.concatenate([np.full((late, 1), 50.0), u])  # before the recording another input acted
+    for k in range(n - 1):
+        x[k + 1] = x[k] + DT * np.array([x[k, 1], acting[k, 0]])
+    found = process_noise(with_input_delay(mass(), late * DT), [SimpleNamespace(u=u, y=x[:, :1], x=x)])
+    assert found.max() < 1e-4  # rounding, at most a millionth of the states' sizes
 
 
 def observer_of(shares, sigma_x=SIGMA_X):

@@ -68,7 +68,9 @@ def ways(folder, tmp_path):
     return ["analyze", folder, "--scenario", "golf_robot", "--out", tmp_path / "out"]
 
 
-@pytest.mark.parametrize("name", RAW)
+@pytest.mark.parametrize(
+    "name", [n if n in ("no JSON", "NaN", "twice") else pytest.param(n, marks=pytest.mark.full) for n in RAW]
+)
 def test_what_is_no_description(folder, tmp_path, name):
     (folder / KIT).write_bytes(RAW[name])
     refused(command(*ways(folder, tmp_path)), name)

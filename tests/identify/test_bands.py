@@ -27,11 +27,11 @@ def growing(rng, runs, tails="normal"):
 
 @pytest.mark.parametrize("tails", ["normal", "heavy"])
 def test_unseen_runs_are_held_as_promised(tails):
-    """Of 40 calibrations on six runs each the mean coverage of unseen runs is 90 % or somewhat more (six runs are few),
+    """Of 20 calibrations on six runs each the mean coverage of unseen runs is 90 % or somewhat more (six runs are few),
     whatever the errors' distribution; 97 % would be bands too wide to be of use."""
     rng = np.random.default_rng(0)
     held = []
-    for _ in range(40):
+    for _ in range(20):
         bands = fit_bands(growing(rng, 6, tails))
         held += [coverage(run, bands) for run in growing(rng, 4, tails)]
     assert 0.9 <= np.mean(held) <= 0.97
@@ -94,14 +94,6 @@ def test_the_interval_score_is_that_of_its_definition():
     half = bands.half_width(np.ones((1, 1, 1)))[0, 0]
     run = RunParts(np.array([[0.0], [half + 0.5]]), np.ones((2, 1, 1)))
     assert interval_score(run, bands) == pytest.approx([2 * half + 0.5 * (2 / 0.1) * 0.5])
-
-
-def test_outputs_of_other_units_have_a_score_each():
-    rng = np.random.default_rng(4)
-    runs = growing(rng, 5)
-    both = [RunParts(np.hstack([r.error, 1e3 * r.error]), np.hstack([r.parts, 1e6 * r.parts])) for r in runs]
-    one, other = np.split(interval_score(both[0], fit_bands(both)), 2)
-    np.testing.assert_allclose(other, 1e3 * one, rtol=1e-3)  # two searches of a flat optimum
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 1.5])

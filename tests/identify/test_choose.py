@@ -99,15 +99,6 @@ def test_the_user_overrules():
         recommend(errors, deploy="rnn")
 
 
-@pytest.mark.parametrize(
-    ("n", "length", "samples", "blocks"), [(1, 800, 1, 8), (1, 800, 400, 2), (3, 90, 1, 9), (12, 9, 1, 12)]
-)
-def test_few_runs_are_cut_into_blocks_that_hang_together(n, length, samples, blocks):
-    rng = np.random.default_rng(5)
-    prior = runs(rng, n=n, length=length)
-    assert recommend({"phy": prior, "pgrnn": prior}, samples=samples).blocks == blocks
-
-
 def test_without_runs_nothing_is_chosen():
     with pytest.raises(InputError, match="HM-IDENTIFY-004"):
         recommend({"phy": [], "pgrnn": []})
@@ -177,13 +168,6 @@ def test_of_two_sure_hybrids_the_one_of_the_lower_ratio_is_taken():
     assert choice.recommended == choice.hybrid == "pgrnn"
 
 
-def test_runs_of_a_single_recording_are_cut_into_blocks():
-    prior = runs(np.random.default_rng(7), n=3)
-    errors = {"phy": prior, "pgrnn": [0.25 * own for own in prior]}
-    assert recommend(errors, recordings=["a", "a", "a"]).blocks == recommend(errors).blocks == 9
-    assert recommend(errors, recordings=["a", "a", "b"]).blocks == 2
-
-
 def test_many_blocks_of_two_days_are_two_pieces_of_evidence():
     """Better on one day and hardly better on the other: another day may be either, however long the recordings are."""
     prior = runs(np.random.default_rng(7), n=8)
@@ -245,14 +229,6 @@ def test_no_share_of_what_does_not_help_is_taken():
     found = recommend(given, recordings=[f"{i}" for i in range(6)], shrunk=blended(prior, hybrid))
     assert (found.recommended, found.share("pgrnn")) == ("phy", 1.0)
     assert found.candidates["pgrnn"].ratio == pytest.approx(1.2, abs=0.02)
-
-
-def test_a_sure_hybrid_is_not_shrunk():
-    rng = np.random.default_rng(7)
-    prior = runs(rng)
-    whole = {"phy": prior, "pgrnn": [0.25 * r for r in prior]}
-    found = recommend(whole, shrunk=lambda name, share: pytest.fail("nothing is to be shrunk"))
-    assert found == recommend(whole)
 
 
 def test_of_what_is_no_better_few_are_taken_by_chance():

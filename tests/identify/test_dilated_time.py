@@ -44,7 +44,9 @@ def runs():
     return [record(seed, seconds=3.0, noise=1e-3) for seed in range(4)]
 
 
-@pytest.mark.parametrize("k", DILATIONS)
+@pytest.mark.parametrize(
+    "k", [DILATIONS[0], DILATIONS[-1], *(pytest.param(k, marks=pytest.mark.full) for k in DILATIONS[1:-1])]
+)
 def test_the_fit_finds_the_parameters_at_any_sampling_period(runs, k):
     *train, valid = [stretched(run, k) for run in runs]
     fit = fit_prior(dilated(k), train, [valid], dt=k * DT)
@@ -80,13 +82,6 @@ def test_windows_are_of_half_a_second_and_two_at_20_ms(runs):
         "free runs of 0.5 s",
         "free runs of 1.5 s",
         "whole recordings",
-    ]
-    known = fit_prior(Pendulum, runs[:1], runs[1:2], dt=DT, time_unit=0.8)
-    assert [row["stage"] for row in known.stages] == [
-        "nominal",
-        "free runs of 0.4 s",
-        "free runs of 1.6 s",
-        "free runs of 2.98 s",
     ]
 
 

@@ -72,11 +72,6 @@ def test_a_given_spread_is_what_the_choice_compares_by():
     assert score(runs, Two(), spread).error == pytest.approx(np.sqrt(squares.mean()))
 
 
-def test_every_sample_counts_alike():
-    short, long = hand_made(10, 4.0), hand_made(990, 2.0)
-    assert score([short, long], Two()).e_sim == pytest.approx(2.02)
-
-
 def test_a_missing_sample_is_no_error_and_a_constant_output_has_no_fit():
     run = hand_made(100, 1.0)
     run.y[3, 0] = np.nan

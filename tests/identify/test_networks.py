@@ -43,22 +43,6 @@ def test_sequence_equals_steps(stack):
     torch.testing.assert_close(h_last, h, rtol=0, atol=1e-13)
 
 
-def test_features_may_be_shared_by_all_networks(stack):
-    shared = S[:, :1]
-    outs, h_last = stack.sequence(shared, stack.initial(5))
-    own, h_own = stack.sequence(shared.expand(-1, 3, -1, -1), stack.initial(5))
-    torch.testing.assert_close(outs, own, rtol=0, atol=1e-13)  # rounding through 7 steps
-    torch.testing.assert_close(h_last, h_own, rtol=0, atol=1e-13)
-
-
-def test_a_network_does_not_depend_on_the_size_of_its_stack(stack):
-    alone, other = (StackedGRU(1, 4, Z, 2, seed=seed) for seed in (1, 2))
-    for name, weight in weights(stack).items():
-        assert torch.equal(weights(alone)[name][0], weight[0])
-        assert not torch.equal(weight[0], weight[1])
-        assert not torch.equal(weight[0], weights(other)[name][0])
-
-
 def test_networks_of_a_stack_learn_alone(stack):
     """The gradient of one network's output is zero for all the others' weights."""
     outs, _ = stack.sequence(S, stack.initial(5))

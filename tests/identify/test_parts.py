@@ -31,19 +31,6 @@ def test_many_recordings_stay_whole_and_parts_are_alike(data):
     assert np.ptp(sizes) <= 10  # no further apart than the smallest recording
 
 
-def test_few_recordings_are_cut_in_time(data):
-    runs = recordings(data[0][0], 120, 80)
-    pieces, part = in_parts(runs, 4, shortest=30)
-    assert [(p.name, len(p.t), i) for p, i in zip(pieces, part, strict=True)] == [
-        ("file0", 60, 0),
-        ("file0", 60, 1),
-        ("file1", 40, 2),
-        ("file1", 40, 3),
-    ]
-    for run in runs:  # nothing is lost, nothing is there twice
-        np.testing.assert_array_equal(np.concatenate([p.t for p in pieces if p.file == run.file]), run.t)
-
-
 def test_what_is_too_short_is_not_cut(data):
     (run,) = recordings(data[0][0], 100)
     assert in_parts([run], 4, shortest=60) == ([run], [-1])
@@ -135,9 +122,3 @@ def test_a_network_without_finite_validation_is_left_out_of_the_mean(data):
     )
     none = replace(trained, validation=np.full(2, np.inf))
     assert none.step(PRIOR, DT).n_h == 2 * SETTINGS.hidden
-
-
-def test_the_mean_of_one_network_is_that_network(data):
-    trained = train(PRIOR, *data, replace(SETTINGS, networks=1))
-    for own, alone in zip(*(trained.step(PRIOR, DT, i).network.parameters() for i in (None, 0)), strict=True):
-        np.testing.assert_array_equal(own, alone)

@@ -90,7 +90,10 @@ class TwoSensors(Pendulum):
         return x.phi, 1e3 * (u.torque - p.d * x.phi_dot)
 
 
-@pytest.mark.parametrize("sensor", [Pendulum, AlongTheArm, Tachometer, TwoSensors])
+@pytest.mark.parametrize(
+    "sensor",
+    [Pendulum, AlongTheArm, *(pytest.param(s, marks=pytest.mark.full) for s in (Tachometer, TwoSensors))],
+)
 def test_true_parameters_are_found_without_noise(sensor):
     found = fitted(sensor, swings(sensor))
     # the recordings are integrated to 1e-10; a step of Runge-Kutta is off by (0.07)^5 / 120 a period
@@ -99,7 +102,8 @@ def test_true_parameters_are_found_without_noise(sensor):
 
 
 @pytest.mark.parametrize(("sensor", "noise"), [
-    (Pendulum, 2e-3), (AlongTheArm, 2e-3), (Tachometer, 2e-2), (TwoSensors, np.array([2e-3, 0.5])),
+    pytest.param(Pendulum, 2e-3, marks=pytest.mark.full), pytest.param(AlongTheArm, 2e-3, marks=pytest.mark.full),
+    (Tachometer, 2e-2), (TwoSensors, np.array([2e-3, 0.5])),
 ])  # fmt: skip
 def test_true_parameters_are_found_in_noise(sensor, noise):
     found = fitted(sensor, swings(sensor, noise))
@@ -234,13 +238,6 @@ def test_a_start_of_ones_own_is_tried_besides_the_nominal_values(noisy_runs):
     assert set(found.standard_errors) == {"J", "mgl"}
 
 
-def test_first_states_need_not_be_measured(noisy_runs):
-    """What trajectories say of states does not count: they are found with the parameters."""
-    wrong = [replace(run, x=np.full_like(run.x, 7.0), xdot=np.full_like(run.x, -3.0)) for run in noisy_runs]
-    ours, theirs = fitted(Pendulum, noisy_runs), fitted(Pendulum, wrong)
-    assert ours.values == theirs.values
-
-
 # what the result says
 
 
@@ -262,26 +259,6 @@ def test_standard_errors_are_the_scatter_over_noise():
         scatter = np.std(error[:, i], ddof=1)
         assert 0.4 < np.median(stated[:, i]) / scatter < 2.5, name
         assert abs(np.mean(error[:, i])) < 4 * scatter / np.sqrt(20), name  # no bias
-
-
-def test_standard_errors_grow_with_the_noise(fit):
-    quiet = fitted(Pendulum, swings(noise=NOISE / 10, n=4))
-    for name in TRUTH:
-        ratio = fit.standard_errors[name] / quiet.standard_errors[name]
-        assert 3 < ratio < 30, (name, ratio)  # proportional to the noise: 10, up to the winner's stage
-
-
-def test_the_winner_explains_the_motion_best(fit):
-    errors = [stage["validation_error"] for stage in fit.stages]
-    assert [stage["stage"] for stage in fit.stages] == [
-        "nominal",
-        "free runs of 0.5 s",
-        "free runs of 2 s",
-        "free runs of 2.98 s",
-    ]
-    assert min(errors) < 0.05 * errors[0]  # the nominal parameters are 20 to 50 % off
-    assert np.isfinite(errors).all()
-    assert fit.best == fit.stages[int(np.argmin(errors))]["stage"]
 
 
 def test_it_says_what_smooths_states(noisy_runs, fit):
@@ -378,12 +355,6 @@ def test_what_an_output_tells_only_together_is_reported():
     assert any("a_1" in line and "k_1" in line for line in found.identifiability)
     ratio = found.values["k_1"] ** 2 / found.values["a_1"]
     assert ratio == pytest.approx(TANKS["k_1"] ** 2 / TANKS["a_1"], rel=0.1)
-
-
-def test_a_motion_that_hides_the_scale_is_reported():
-    # almost no torque: only the ratios of J, mgl and d show, and their errors go together
-    hidden = fitted(Pendulum, swings(noise=NOISE, n=4, size=1e-3))
-    assert "J and mgl can hardly be told apart" in " ".join(hidden.identifiability)
 
 
 def test_nothing_that_moves_tells_nothing():

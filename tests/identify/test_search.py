@@ -1,6 +1,5 @@
 """The search of settings: repeatable, resumable, decided by validation alone, and what it refuses."""
 
-import json
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -99,12 +98,6 @@ def test_bad_settings_are_pruned_and_good_ones_are_not(whole):
     complete = [r for r in result.trials if r.state == "complete"]
     assert all(r.steps == TOTAL for r in complete)
     assert all(r.mean == pytest.approx(r.value + 0.1) for r in complete)  # the fake's other network
-
-
-def test_the_journal_is_lines_of_json_and_the_only_file(whole):
-    _, storage = whole
-    assert all(isinstance(json.loads(line), dict) for line in storage.read_text().splitlines())
-    assert [f.name for f in storage.parent.iterdir()] == [storage.name]
 
 
 def test_the_same_seed_gives_the_same_trials_and_another_seed_others(quick, whole, data, tmp_path):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from closed_loop_parts import Recorder, make_ekf, run
+from closed_loop_parts import Recorder, run
 from online_models import PendulumPlant
 
 from hybrid_mpc import Fault, InputError, check_plant_faults, corrupt_input, corrupt_measurement
@@ -175,32 +175,3 @@ def test_measurement_faults_act_when_they_say(model, safe, target, change):
     np.testing.assert_array_equal(y[k], change(y, free[k], k))
     rest = np.setdiff1d(np.arange(30), k)
     np.testing.assert_array_equal(y[rest], free[rest])
-
-
-def test_a_fault_leaves_everything_before_it_as_it_was(model, safe):
-    without, fault = run(model, safe), run(model, safe, faults=[Fault(0.3, 0.4, "measurement_offset", 0.2)])
-    for name in ("x", "y", "u", "x_hat", "h", "d"):
-        np.testing.assert_array_equal(getattr(without, name)[:15], getattr(fault, name)[:15])
-    assert np.all(without.u[15] != fault.u[15])
-
-
-def test_in_a_dropout_the_filter_predicts_only(model, safe):
-    steps = []
-    run(model, safe, faults=[Fault(0.2, 0.4, "measurement_dropout")], on_step=steps.append)
-    ekf = make_ekf(model)
-    for k in range(10, 20):
-        predicted = ekf.predict(steps[k - 1].estimate, steps[k - 1].decision.u)
-        for name in ("x", "h", "d", "P"):
-            np.testing.assert_array_equal(getattr(predicted, name), getattr(steps[k].estimate, name))
-        assert steps[k].decision.source.name == "MPC"  # control goes on
-    corrected = steps[20].estimate
-    assert np.isfinite(corrected.nis)
-
-
-def test_a_dropout_at_the_start_is_survived(model, safe):
-    result = run(
-        model, safe, faults=[Fault(0.0, 0.1, "measurement_dropout"), Fault(0.0, 0.2, "measurement_freeze")]
-    )
-    assert np.all(np.isnan(result.y[:10]))  # nothing had arrived that could have been repeated
-    assert np.all(np.isfinite(result.u))
-    assert abs(result.x_hat[-1, 0] - result.x[-1, 0]) < 0.01  # 10 sigma of the sensor, after 20 measurements

@@ -5,14 +5,13 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from closed_loop_parts import DT, LateRig, Rig, ScriptedMonitor, hold, make_ekf, make_safe, run, sine
+from closed_loop_parts import DT, Rig, ScriptedMonitor, hold, make_ekf, make_safe, run, sine
 from monitor_parts import by_hand, energy, of_force
 from online_models import PendulumPlant, pendulum_model
 
 from hybrid_mpc import (
     OCP,
     CondensedController,
-    DelayCompensation,
     Fault,
     Guard,
     InputError,
@@ -121,21 +120,6 @@ def test_it_goes_on_from_a_state(model, safe):
     np.testing.assert_array_equal(drive(again, second, 10, begun=True)[12:], np.array(rig.u)[12:])
     assert again.switches == loop.switches
     assert [s.after for s in loop.switches] == [Mode.BACKUP]
-
-
-def test_a_state_is_frozen(model, safe):
-    loop = make_loop(model, safe, monitor=monitored(model))
-    drive(loop, n=5)
-    state = loop.state
-    copies = state.estimate.x.copy(), state.decision.u.copy(), state.monitor.readings.memory.copy()
-    rig = Rig()
-    drive(loop, rig, 8, begun=True)
-    for now, before in zip(
-        (state.estimate.x, state.decision.u, state.monitor.readings.memory), copies, strict=True
-    ):
-        np.testing.assert_array_equal(now, before)
-    with pytest.raises(AttributeError):
-        state.k = 3
 
 
 def test_the_input_that_acted_is_believed(model):
@@ -287,20 +271,3 @@ def test_what_cannot_be_is_refused(model, safe):
     oracle = make_loop(model, safe, estimator=TrueState(model))
     with pytest.raises(InputError, match="HM-LOOP-023"):
         oracle.start([0.0])
-
-
-def test_delays(model, safe):
-    ekf = DelayCompensation(make_ekf(model), input_delay=1)
-    want = run(model, safe, estimator=ekf, input_delay=1, monitor=monitored(model))
-
-    loop = make_loop(model, safe, estimator=ekf, input_delay=1, monitor=monitored(model))
-    np.testing.assert_array_equal(drive(loop, LateRig()), want.u)
-    assert loop.reading.share == want.share[-1] > 0.0
-
-
-def test_warming_up_leaves_nothing(model, safe):
-    fresh, warm = (make_loop(model, safe, monitor=monitored(model)) for _ in range(2))
-    warm.warm_up()
-    with pytest.raises(InputError, match="HM-LOOP-021"):
-        _ = warm.state
-    np.testing.assert_array_equal(drive(fresh), drive(warm))

@@ -159,15 +159,6 @@ def test_after_a_very_long_break_the_estimate_starts_anew(model):
     assert report.x_hat[5, 0] == pytest.approx(report.y[5, 0], abs=1e-12)  # Newton's tolerance
 
 
-def test_a_machine_too_slow_for_its_period_keeps_trying(model):
-    clock = FakeClock()
-    controller = Slow(make_safe(model, horizon=10).controller, clock, dict.fromkeys(range(-2, 999), 0.03))
-    report = make_runner(model, SafeController(controller, safe_input=[0.0]), Rig(), clock).run(N * DT)
-    assert controller.k > report.periods / 3  # solves go on being begun
-    assert report.late == report.periods - 1  # the first input was decided before the clock began
-    assert np.all(np.abs(report.u) <= 6.0)
-
-
 def test_stop_and_the_rows_kept(model, safe):
     rig, steps = Rig(), []
     runner = make_runner(model, safe, rig, keep=4, on_step=steps.append)
@@ -178,13 +169,6 @@ def test_stop_and_the_rows_kept(model, safe):
     empty = make_runner(model, safe, Rig()).run(stop=lambda: True)
     assert empty.periods == 0
     assert np.isnan(empty.percentiles()["solve"]["p99"])
-
-
-def test_two_runs_of_one_runner_are_independent(model, safe):
-    runner = make_runner(model, safe, rig := Rig())
-    first = runner.run(N * DT)
-    rig.__post_init__()
-    same(runner.run(N * DT), first)
 
 
 def test_in_real_time():

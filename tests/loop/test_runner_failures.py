@@ -152,18 +152,6 @@ def test_on_a_dead_clock_the_run_ends(model, safe, kind, error, words, periods, 
     assert rig.u[-1] == [0.25]
 
 
-def test_a_clock_that_wakes_early_is_asked_again(model, safe):
-    class Restless(FakeClock):
-        def sleep_until(self, t):
-            self.t += 0.5 * max(t - self.t, 0.0)
-
-    clock = Restless()
-    report = make_runner(model, safe, Rig(), clock).run(N * DT)
-    assert report.periods == N
-    # Ten halvings leave less than a thousandth of a period, the share that may be missing.
-    assert -1e-3 * 1e3 * DT <= report.lateness_ms.min() <= 0.0
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

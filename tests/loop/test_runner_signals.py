@@ -229,19 +229,6 @@ def test_handlers_are_those_of_before(model, safe, foreground, error):
     assert changed <= {"SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGXCPU", "SIGTSTP"}
 
 
-def test_a_handler_installed_during_the_run_stays(foreground):
-    def later(number, frame):
-        pass
-
-    before = signal.getsignal(signal.SIGHUP)
-    try:
-        with SafeEnd(lambda: None):
-            signal.signal(signal.SIGHUP, later)
-        assert signal.getsignal(signal.SIGHUP) is later
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
 def test_in_another_thread_no_handler_is_touched():
     seen = []
 

@@ -1,29 +1,25 @@
 """The simulation itself: what is called when, what is recorded, what is refused."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
 from closed_loop_parts import DT, Recorder, ScriptedReading, hold, make_ekf, make_safe, run, sine
-from machines import MachinePlant
 from monitor_parts import energy
-from online_models import PendulumPlant, linear_model, pendulum_model
+from online_models import PendulumPlant, pendulum_model
 
 from hybrid_mpc import (
     OCP,
     ClosedLoopResult,
     CondensedController,
     DelayCompensation,
-    ExtendedKalmanFilter,
     Fault,
     HardBound,
     InputError,
     SafeController,
     TrueState,
-    simulate,
 )
 from hybrid_mpc.compare.loops import share_given_way
-from hybrid_mpc.loop.plant import SimulatedMachine
 
 
 def test_two_runs_differ_in_nothing_but_durations(model, safe):
@@ -40,21 +36,6 @@ def test_two_runs_differ_in_nothing_but_durations(model, safe):
                     getattr(first, field.name), getattr(other, field.name), field.name
                 )
     assert np.isfinite(first.violation).any()
-
-
-def test_durations_are_those_of_the_clock_that_is_given(safe):
-    ticks = iter(range(10**6))
-    found = run(pendulum_model(z=2), safe, seed=0, now=lambda: float(next(ticks)))
-    # a tick at either end of each part
-    assert np.all(found.timing_ms["solve"] == 1e3)
-    assert np.all(found.timing_ms["estimate"][1:] == 1e3)
-
-
-def test_the_seed_changes_the_noise_and_only_the_noise(model, safe):
-    one, two = (run(model, safe, seed=seed) for seed in (0, 1))
-    assert not np.array_equal(one.y, two.y)
-    np.testing.assert_array_equal(one.reference, two.reference)
-    np.testing.assert_array_equal(one.x[0], two.x[0])
 
 
 def test_the_record_has_a_row_for_every_period(model, safe):
@@ -111,17 +92,6 @@ def test_the_record_tells_which_hard_bounds_gave_way(model, safe):
 
 def replace_weights(ocp):
     return OCP(ocp.horizon, [1.0, 0.0], [1.0], [0.0], ocp.u_min, ocp.u_max)
-
-
-def test_plant_gets_the_inputs_one_period_after_the_other(model, safe):
-    inputs = []
-    result = run(model, safe, plant=Recorder(PendulumPlant(), inputs))
-    np.testing.assert_array_equal(inputs, result.u)
-    plant, x = PendulumPlant(), np.array([0.1, 0.0])
-    state = plant.reset(x, 0)
-    for k in range(10):
-        np.testing.assert_array_equal(result.x[k], plant.truth(state))
-        state = plant.step(state, result.u[k], DT)
 
 
 def test_true_state_is_handed_the_truth(model, safe):
@@ -271,39 +241,3 @@ def test_a_late_solve_is_the_shifted_plan(model, safe):
     never = run(model, safe, late=lambda t: True)
     assert set(never.status) == {"LATE"}
     assert set(never.source) == {"PLAN", "FALLBACK"}
-
-
-def test_several_inputs_and_outputs():
-    a, b = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0, 0.1], [0.1, 0.0]])
-    model = linear_model(a, b, np.eye(2))
-    ekf = ExtendedKalmanFilter(
-        model,
-        sigma_y=[1e-4] * 2,
-        sigma_x=[1e-3] * 2,
-        sigma_d=[1e-2] * 2,
-        sigma_x0=[1e-2] * 2,
-        sigma_d0=[0.1] * 2,
-    )
-    controller = CondensedController(
-        model, OCP(15, [10.0, 1.0], [1e-4] * 2, [0.0] * 2, [-3.0] * 2, [3.0] * 2)
-    )
-    zero = lambda t: np.zeros((len(t), 2))  # noqa: E731
-    plant = MachinePlant(model, np.array([0.0, 0.2]), sigma=1e-4)
-    result = simulate(plant, ekf, controller, zero, dt=0.1, duration=8.0, x0=[1.0, 0.0], seed=0)
-    # Sensor noise of 1e-4 makes d jitter by some 1e-3 to 1e-2 (its random walk is 1e-2 a period).
-    np.testing.assert_allclose(result.d[-20:].mean(axis=0), [0.0, 0.2], atol=5e-3)
-    assert np.max(np.abs(result.x[-20:, 0])) < 5e-3
-    assert replace(result, dt=0.2).cost == pytest.approx(2 * result.cost)
-
-
-def test_a_machine_remembers_its_delays_and_no_more():
-    machine = SimulatedMachine(PendulumPlant(), np.zeros(2), 0, ("q",), ("u",), (), DT, 2, 3)
-    machine.rest(np.zeros(1))
-    held, lengths = [], []
-    for k in range(20):
-        machine.measure(k * DT)
-        held.append(machine.command(np.array([float(k)])))
-        machine.advance(k * DT)
-        lengths.append(sum(len(v) for v in vars(machine).values() if isinstance(v, list)))
-    assert held[7] == (np.array([4.0]), np.array([3.0]))  # three periods late
-    assert len(set(lengths)) == 1

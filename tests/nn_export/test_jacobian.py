@@ -208,25 +208,6 @@ class Long(nn.Module):
         return torch.cat(self.cell(x, (s[:3], s[3:])))
 
 
-@pytest.mark.parametrize("direction", ["forward", "adjoint"])
-def test_sweeps_through_a_cell(direction):
-    torch.manual_seed(5)
-    module = Long().double()
-    function = build(trace(module, (torch.zeros(2), torch.zeros(6))))
-    x, s = torch.tensor([0.3, -0.4]).double(), torch.linspace(-1, 1, 6).double()
-    dx, ds = torch.tensor([0.7, 0.2]).double(), torch.linspace(0.5, -0.3, 6).double()
-    by = [ca.MX.sym("x", 2), ca.MX.sym("s", 6)]
-    if direction == "forward":
-        expected = torch.func.jvp(module, (x, s), (dx, ds))[1].detach().numpy()
-        swept = ca.jtimes(function(*by), ca.vertcat(*by), np.concatenate([dx, ds]))
-    else:
-        expected = torch.cat(torch.func.vjp(module, x, s)[1](ds)).detach().numpy()
-        swept = ca.jtimes(function(*by), ca.vertcat(*by), ds.numpy(), True)
-    given = ca.Function("swept", by, [swept])(x.numpy(), s.numpy()).full().ravel()
-    # Some fifty roundings of numbers of order one.
-    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-14)
-
-
 def test_a_sum_added_to_its_vector_has_the_right_jacobian():
     function = to_casadi(Call(lambda x: x + x.sum()), (torch.zeros(4),))
     x = ca.MX.sym("x", 4)

@@ -83,8 +83,3 @@ def test_an_unknown_controller_is_drawn_under_its_name():
 def test_costs_without_an_oracle_are_refused(table):
     with pytest.raises(InputError, match="HM-PLOTS-028"):
         costs(table)
-
-
-def test_same_data_same_bytes(tmp_path):
-    files = [save(costs({"track": ROW}), tmp_path / f"{i}.png") for i in range(2)]
-    assert files[0].read_bytes() == files[1].read_bytes()

@@ -92,15 +92,6 @@ def test_commands_act_late_and_sensors_have_steps(mujoco):
         plant.step(first, np.zeros(2), 0.003)
 
 
-def test_the_plant_stays_within_a_fifth_of_what_was_fitted():
-    p = DoublePendulumPlant()
-    own = {"I_1": p.J_1 + p.m_1 * p.r_1**2, "I_2": p.J_2 + p.m_2 * p.r_2**2, "mr_1": p.m_1 * p.r_1,
-           "mr_2": p.m_2 * p.r_2, "F_1": p.F_1, "F_2": p.F_2}  # fmt: skip
-    for name, value in own.items():
-        assert value == pytest.approx(FITTED[name], rel=0.2)
-        assert value != FITTED[name]
-
-
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.full) for n in TASKS]
 )  # fmt: skip
@@ -124,22 +115,6 @@ def test_a_delay_that_the_model_knows_is_not_taken_for_loads(mujoco):
         return float((((closed("acrobot_push", delay).x - UPRIGHT) ** 2) @ control.q).sum())
 
     assert errors(DELAY) < 0.1 * errors(0.0)
-
-
-def test_the_figures_tell_standing_from_lying():
-    n = 300
-    still = np.tile(UPRIGHT, (n, 1))
-    up = still.copy()
-    up[:100, 0] = 0.0
-
-    class Result:
-        t = 0.01 * np.arange(n)
-        x = up
-
-    figures = TASKS["pendubot_swing_up"].figures
-    assert figures(Result) == {"up_at_s": pytest.approx(1.0), "hold_rmse_rad": 0.0}
-    Result.x = still * 0.5
-    assert figures(Result)["up_at_s"] == np.inf
 
 
 def test_recorded_pushes_are_read_from_their_columns(tmp_path, monkeypatch):

@@ -7,32 +7,15 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError
-from hybrid_mpc.data.differentiate import local_polynomial
 from hybrid_mpc.plots import save
 from scenarios.golf_robot import scenario
 from scenarios.golf_robot.data import make_data, record, stems
-from scenarios.golf_robot.effects import measure_effects, smoothing
+from scenarios.golf_robot.effects import measure_effects
 from scenarios.golf_robot.excitation import KINDS, excitation
 from scenarios.golf_robot.nominal import GEAR, PARAMETERS
 from scenarios.golf_robot.oracle import oracle
-from scenarios.golf_robot.prior import GolfRobotPrior
 from scenarios.golf_robot.rig import Rig
 from scenarios.golf_robot.tasks import FOLLOW_THROUGH, IMPACT, LONG_FOLLOW_THROUGH, impact
-
-
-def test_prior_agrees_with_the_oracle_s_energy_balance():
-    model, prior = oracle(0.02), GolfRobotPrior()
-    rng = np.random.default_rng(0)
-    for x, w, u in zip(*(rng.normal(size=(20, n)) for n in (2, 2, 1)), strict=True):
-        expected = float(prior.equations.balances[0].residual(x, w, u, [], prior.p))
-        balance = float(model.balances[0].residual(x, w, u, model.w, model.p))
-        assert balance == pytest.approx(expected, abs=1e-12)  # same formula
-
-
-def test_friction_slope_at_rest_is_stable_at_all_bounds():
-    p = {s.name: s for s in PARAMETERS}
-    slope = p["r"].upper * p["mu"].upper * p["gamma"].upper * p["m"].upper * p["g"].upper / p["J"].lower
-    assert slope * 0.01 < 2  # sub-steps of 10 ms
 
 
 def run_beside(torques, x0):
@@ -69,29 +52,6 @@ def test_oracle_jacobian_is_the_derivative_of_its_step():
         wanted = [m.full() for m in own(z[:2], z[2:], 0.1)]
         for given, want in zip((np.vstack([x_next, h_next]), a, b), wanted, strict=True):
             assert given == pytest.approx(want, rel=1e-9, abs=1e-10)  # rounding of entries up to 100
-
-
-def test_oracle_s_jacobian_is_sane_through_stiction_and_backlash():
-    """Along a motion that sticks and reverses, no direction explodes within a period."""
-    model, rig = oracle(0.02), Rig()
-    state, largest = rig.reset(np.array([0.0, 0.0]), 0), 0.0
-    # size of each state in use: rad, rad/s, -, N m, rad, rad/s
-    scale = np.array([1.0, 3.0, 1.5, 0.5, 5e-3, 3.0])
-    for k in range(200):
-        u = np.array([0.12 * np.sin(2 * np.pi * 0.5 * 0.02 * k)])
-        a, b = (
-            m.full()
-            for m in model.with_jacobian(rig.truth(state), rig.hidden(state), u, model.w, model.p)[2:]
-        )
-        assert np.isfinite(a).all()
-        largest = max(largest, np.abs(np.linalg.eigvals(a)).max())
-        # the largest: a stuck club's bristles take up 1500 / 36 of a speed, 83 in these scales
-        assert np.linalg.norm(a * scale / scale[:, None], 2) < 100
-        assert 0 <= b[1, 0] < 2 * 0.02 * GEAR / 0.15  # at most twice what a free club would take up
-        state = rig.step(state, u, 0.02)
-    # bristle damping fades with the speed, just after a reversal by up to
-    # 2 * 0.45 r m g sigma1 / J = 30 1/s of negative slope: a factor 2 in 20 ms, cogging and belt beside it
-    assert largest < 3
 
 
 @pytest.mark.full
@@ -173,13 +133,6 @@ def test_data_reach_what_they_promise_and_leave_something_to_learn():
     assert effects.residual > 3 * effects.noise_floor
     assert 0.03 < effects.residual_moving < effects.residual
     assert all(value > 0 for value in effects.torques.values())
-
-
-def test_smoothed_second_differences_are_the_differentiated_angle():
-    phi = np.cumsum(np.random.default_rng(0).normal(size=200))
-    second = (phi[2:] - 2 * phi[1:-1] + phi[:-2]) / 0.01**2
-    direct = local_polynomial(phi, 0.01, 0.25).second[12:-12]
-    assert np.convolve(second, smoothing()[::-1], "valid") == pytest.approx(direct, rel=1e-9, abs=1e-6)
 
 
 FOLLOWED = [task for task in scenario.tasks if task.weight is None]

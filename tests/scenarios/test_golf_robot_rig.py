@@ -14,7 +14,6 @@ from scenarios.golf_robot.dynamics import (
     LOSSES,
     N_STATES,
     RigParameters,
-    elastic,
     powers,
     rhs,
     stored_energy,
@@ -71,30 +70,6 @@ def test_energy_bookkeeping_closes():
     assert abs(gap) < 1e-6 * lost  # integration error alone; a wrong sign or a lost term gives order 1
 
 
-def test_belt_torque_is_the_slope_of_the_belt_s_energy():
-    s = ca.SX.sym("s", N_STATES)
-    torque, share = elastic(s[4], P)
-    motor = GEAR * P.cogging * ca.sin(GEAR * P.cogging_order * (s[0] + s[4]))
-    slope = ca.gradient(stored_energy(s, P), s)[4] + motor
-    f = ca.Function("f", [s], [torque, slope, share, ca.gradient(torque, s)[4] / P.belt_stiffness])
-    for twist in (-4e-3, -P.gap, -2e-4, 0.0, P.gap, 2e-3):
-        values = [float(value) for value in f([0.1, 0, 0, 0, twist, 0])]
-        assert values[0] == pytest.approx(values[1], abs=1e-9)  # rounding of 1e-4 rad^2 / flank
-        assert values[2] == pytest.approx(values[3], abs=1e-12)
-    stiff, loose = float(f([0, 0, 0, 0, 10e-3, 0])[2]), float(f([0, 0, 0, 0, 0, 0])[2])
-    assert stiff > 0.99
-    assert loose < 0.05  # 1 - gap / sqrt(gap^2 + flank^2) = 2 %
-
-
-def test_stuck_club_lets_the_motor_turn_by_gap_and_stretch():
-    held = replace(P, mu_c=50.0, mu_s=60.0, cogging=0.0)  # a bearing that is jammed
-    ends = [drive(Rig(held), np.full(50, u), x0=(0.0, 0.0))[-1] for u in (0.2, -0.2)]
-    torque = GEAR * (0.2 * P.motor_gain) - GEAR * P.motor_friction  # friction may hold as much back
-    for end, sign in zip(ends, (1, -1), strict=True):
-        most = P.gap + GEAR * 0.2 * P.motor_gain / P.belt_stiffness
-        assert 0.98 * (P.gap + torque / P.belt_stiffness) < sign * end[4] < 1.02 * most  # flank: below 2 %
-
-
 def test_torque_below_break_away_does_not_move_the_club():
     hold = P.r * P.m * P.g * P.mu_c * (1 - P.asymmetry)  # Coulomb level: below the static one
     stuck = drive(Rig(), np.full(100, 0.7 * hold / GEAR), x0=(0.0, 0.0))[-1]
@@ -103,28 +78,6 @@ def test_torque_below_break_away_does_not_move_the_club():
     later = drive(Rig(), np.full(350, 0.7 * hold / GEAR), x0=(0.0, 0.0))[-1]
     assert abs(later[0] - stuck[0]) < 1e-5  # no creep
     assert drive(Rig(), np.full(100, 3 * hold / GEAR), x0=(0.0, 0.0))[-1, 0] > 0.05  # above, it moves
-
-
-def test_static_friction_holds_the_club_off_the_bottom():
-    angle = 0.5 * P.r * P.mu_c * (1 - P.asymmetry) / P.a  # gravity is half of what friction holds there
-    end = drive(Rig(), np.zeros(250), x0=(angle, 0.0))[-1]
-    assert abs(end[0] - angle) < 2 * P.mu_s / P.sigma0  # settles within the bristles' deflection
-    assert abs(end[1]) < 1e-6  # at rest; a viscous model would have gone to the bottom
-
-
-def test_friction_never_feeds_energy_into_a_free_swing():
-    states = drive(Rig(), np.zeros(250), x0=(1.0, 0.0))
-    # cogging potential (0.4 mJ against 2.4 J/rad of gravity at this height) allows 1 mrad
-    assert np.abs(states[:, 0]).max() < 1 + 1e-3
-    assert abs(states[-1, 1]) < 1e-3
-    assert abs(states[-1, 0]) < 2 * P.r * P.mu_s / P.a  # at rest within the friction's reach
-
-
-def test_motor_torque_follows_with_its_lag():
-    rig = Rig()
-    state = rig.step(rig.reset(np.zeros(2), 0), np.array([0.1]), P.lag)
-    # exact; RK4 at 0.1 lag
-    assert state.z[3] == pytest.approx(0.1 * P.motor_gain * (1 - np.exp(-1)), rel=1e-4)
 
 
 def test_without_losses_and_gap_it_is_the_pendulum_of_both_inertias():

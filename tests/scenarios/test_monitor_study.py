@@ -5,19 +5,15 @@ import sys
 from functools import partial
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import trivial_runs
 
 from hybrid_mpc import ChannelLimit, InputError, WatchLimits
 from hybrid_mpc.compare.study_run import run_batch
-from hybrid_mpc.loop.faults import install
-from scenarios.golf_robot import scenario
 from scenarios.golf_robot.monitor_study import run as room
 from scenarios.golf_robot.monitor_study.__main__ import main
 from scenarios.golf_robot.monitor_study.detection import METHODS, Detectors
-from scenarios.golf_robot.monitor_study.plan import CASES, LoopPlan, MonitorStudy, monitor_study
-from scenarios.golf_robot.monitor_study.results import roc
+from scenarios.golf_robot.monitor_study.plan import CASES, MonitorStudy, monitor_study
 
 SMALL = MonitorStudy("golf_robot", "nowhere", nominal_hours=0.5, seeds=3, guard_seeds=2, rates=(1.0,))
 
@@ -35,14 +31,6 @@ def test_seeds_are_common_only_where_they_shall_be():
     plans = [p for j in jobs if j.kind == "nominal" for p in j.plans]
     assert 3 * sum(p.case != "none" for p in plans) <= len(plans) + 2
     assert {p.case for p in plans} == {"none", "drift_up", "drift_down"}
-
-
-def test_friction_drifts_both_ways():
-    plan = LoopPlan("drift_up", "task", 0, 180.0)
-    rig, outside = install(scenario.plant(), plan.faults(0.02))
-    assert outside == ()
-    factors = [rig._conditions(t)["plant_friction"] for t in (0.0, 30.0, 60.0, 150.0, 179.0)]
-    assert np.allclose(factors, [1.0, 1.05, 1.1, 0.9, 0.9], atol=1e-12)  # products of exact factors
 
 
 def row_of(job):
@@ -147,12 +135,3 @@ def test_budgets_and_numbers():
     assert len({case.name for case in CASES}) == len(CASES)
     with pytest.raises(InputError, match=r"nominal_hours = -1.*HM-SCENARIOS-011"):
         MonitorStudy("golf_robot", "m", nominal_hours=-1)
-
-
-def test_operating_curve_falls():
-    rng = np.random.default_rng(0)
-    loops = [{"blocks": {"guard": rng.gumbel(size=100).tolist()}}]
-    curve = roc(loops, [{"scores": {"guard": s}} for s in rng.gumbel(2.0, size=50)], "guard")
-    assert np.all(np.diff(curve["per_hour"]) <= 0)
-    assert np.all(np.diff(curve["found"]) <= 0)
-    assert curve["found"][-1] == curve["per_hour"][-1] == 0.0

@@ -1,6 +1,5 @@
 """Methods of detection, learned and judged alike, on made-up readings."""
 
-import json
 import math
 
 import numpy as np
@@ -8,13 +7,10 @@ import pytest
 from monitor_parts import energy
 
 from hybrid_mpc import InputError
-from hybrid_mpc.records import plain, record
 from scenarios.golf_robot.monitor_study.detection import (
     METHODS,
-    Detectors,
     Trace,
     learn_detectors,
-    with_hysteresis,
 )
 
 STEP, RATE = 1.5e-3, 2.5
@@ -75,26 +71,6 @@ def test_rates_are_shared_and_thresholds_fall_with_them(detectors):
         assert math.isclose(sum(shares.values()), 1.0)
 
 
-def test_score_passes_one_where_a_part_passes_its_threshold(detectors):
-    levels = detectors.levels(trace(13, output=3e-3))
-    score = detectors.score(levels, "innovation_rms", RATE)
-    assert np.array_equal(score > 1.0, levels["innovation_rms"] > detectors.threshold("innovation_rms", RATE))
-
-
-def test_round_trip(detectors):
-    again = record(Detectors, json.loads(json.dumps(plain(detectors))), "")
-    assert again.threshold("power", 3.0) == detectors.threshold("power", 3.0)
-    assert again.limits == detectors.limits
-
-
 def test_too_little_data_says_how_much_is_needed():
     with pytest.raises(InputError, match=r"2\.9.*12\.0.*HM-SCENARIOS-010"):
         learn_detectors([trace(0)], READINGS, (STEP,), rate=1.0)
-
-
-def test_hysteresis_is_that_of_a_loop():
-    level, on, wanted = np.random.default_rng(0).uniform(0, 1.5, 500), False, []
-    for value in level:
-        on = value > (0.5 if on else 1.0)
-        wanted.append(on)
-    assert with_hysteresis(level, 1.0).tolist() == wanted

@@ -10,19 +10,16 @@ import pytest
 import hybrid_mpc as hm
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.kit.artifact import build_model
-from hybrid_mpc.kit.assembly import tuned_noise
 from hybrid_mpc.model.delay import with_input_delay
-from scenarios.cascaded_tanks import REST as TANKS_REST
 from scenarios.cascaded_tanks import scenario as tanks
 from scenarios.cascaded_tanks.plant import CascadedTanksPlant
 from scenarios.coupled_drives import scenario as drives
 from scenarios.coupled_drives.plant import CoupledDrivesPlant
 from scenarios.heat_exchanger import scenario as exchanger
 from scenarios.heat_exchanger.plant import HeatExchangerPlant
-from scenarios.heat_exchanger.tasks import DAY, saw_tooth
+from scenarios.heat_exchanger.tasks import DAY
 from scenarios.race_car import scenario as car
 from scenarios.race_car.plant import RaceCarPlant
-from scenarios.race_car.prior import WHEELBASE
 from scenarios.temperature_lab import scenario as lab
 from scenarios.temperature_lab.plant import TemperatureLabPlant
 
@@ -89,18 +86,6 @@ def test_the_lab_radiates_and_its_power_lags():
     assert jump[5] == pytest.approx(70.0 / plant.lag_power)
 
 
-def test_the_room_of_the_lab_sways():
-    plant = TemperatureLabPlant()
-    state, room = plant.reset(np.array(lab.tasks[0].x0), 0), []
-    for _ in range(54):
-        state = plant.step(state, np.array([30.0, 30.0]), 100.0)
-        room.append(plant.truth(state)[4])
-    t = 100.0 * np.arange(1, 55)
-    np.testing.assert_allclose(
-        room, 24.0 + 1.5 * np.sin(2 * np.pi * t / 5400.0), atol=1e-5
-    )  # integrated to 1e-8
-
-
 def test_the_tanks_have_sharp_edges_and_no_ideal_orifices():
     plant = CascadedTanksPlant()
 
@@ -126,11 +111,6 @@ def test_the_exchanger_follows_its_valve_over_three_lags():
     cold, hot = (r * plant.lag_plates + z[2] + plant.loss * (z[2] - 22.0) for r in ends)
     assert cold == pytest.approx(DAY[1], abs=1e-6)
     assert hot == pytest.approx(0.66 * 78.0 + 0.34 * DAY[1], abs=1e-6)
-
-
-def test_the_reservoir_is_a_saw_tooth():
-    w = saw_tooth(np.array([0.0, 240.0, 335.0, 430.0, 550.0]))[:, 0]
-    assert w == pytest.approx([75.5, 78.2, 76.85, 75.5, 76.85])
 
 
 def test_the_belt_holds_the_drives_back_and_stiffens():
@@ -223,34 +203,6 @@ def test_the_priors_controller_keeps_the_car_on_its_path(task):
     assert np.all((result.u >= car.control.u_min) & (result.u <= car.control.u_max))
 
 
-def test_no_recording_changes_the_noise_that_a_scenario_declares():
-    """The scale that recordings find likeliest is that of the other states."""
-    model, n = fitted_model("heat_exchanger"), 60
-    x = np.tile(model.x0, (n, 1))
-    y = x[:, :1] + 0.065 * np.random.default_rng(0).standard_normal((n, 1))
-    u, w = np.tile(model.u0, (n, 1)), np.tile(model.w, (n, 1))
-    still = hm.Trajectory("still", "train", model.dt, model.dt * np.arange(n), u, y, x, 0 * x, w=w)
-    base = np.array([0.02, 0.7])
-    found = tuned_noise(model, exchanger, base, [still], observer=False, known=exchanger.state_noise)
-    assert found[1] == exchanger.state_noise["cold"]
-    assert found[0] in (0.02, pytest.approx(0.06))
-    assert tuned_noise(model, exchanger, base, [still], observer=False)[1] >= 0.7
-
-
-@pytest.mark.parametrize("task", car.tasks, ids=lambda task: task.name)
-def test_wheels_that_roll_can_follow_the_paths(task):
-    """Without slip no path asks for more steering than there is; its speeds are those of its positions."""
-    t = car.data.dt * np.arange(round(task.duration / car.data.dt))
-    x, y, heading, speed = task.reference(t)[:, :4].T
-    np.testing.assert_allclose(
-        np.gradient(x, t), speed * np.cos(heading), atol=0.01
-    )  # differences over two periods
-    np.testing.assert_allclose(np.gradient(y, t), speed * np.sin(heading), atol=0.02)
-    wheels = np.arctan(WHEELBASE * np.gradient(heading, t) / speed)
-    assert np.max(np.abs(wheels)) < FITTED["race_car"]["k"] * car.control.u_max[0]
-    assert np.max(speed) < car.control.u_max[1]
-
-
 @pytest.mark.full
 def test_the_benchmarks_linear_model_is_the_tangent_of_a_delayed_one(monkeypatch):
     """At the operating point both step alike, delayed input and all; beside it they part by the curvature alone."""
@@ -267,15 +219,3 @@ def test_the_benchmarks_linear_model_is_the_tangent_of_a_delayed_one(monkeypatch
 
     assert apart(0.0) < 1e-12
     assert apart(0.1) == pytest.approx(apart(0.2) / 4, rel=0.3)  # of second order, and what comes after
-
-
-def test_levels_ask_for_a_full_upper_tank():
-    """The second level needs more than the upper tank's outlet gives at the plant's edge: it runs over."""
-    plant = CascadedTanksPlant()
-    most = plant.k_1 * plant.edge_1**plant.exponent
-    lower = np.roots(
-        [plant.bend, 1 - 10 * plant.bend, -tanks.tasks[0].reference(np.array([1200.0]))[0, 0]]
-    ).max()
-    assert plant.k_2 * lower**plant.exponent > most
-    assert tanks.control.x_max[0] > plant.edge_1
-    assert tanks.tasks[0].x0 == TANKS_REST

@@ -69,12 +69,6 @@ def test_what_friction_may_hold_or_nobody_has_bounded_does_not(limit):
     assert frozen(u, y, monitor(limit)) == []
 
 
-def test_it_stays_frozen_without_input_until_the_sensor_moves():
-    u, y = pulling(0.1, 0.7)
-    u[60:], y[80:] = 0.0, STEP
-    assert frozen(u, y, monitor()) == list(range(52, 80))
-
-
 def moved(u, model, x0=(0.0, 0.0)):
     """States under the inputs, and what the sensor says of them."""
     x, h = [np.array(x0)], [np.zeros(model.n_h)]
@@ -125,11 +119,3 @@ def test_a_missing_estimate_or_sample_begins_anew():
     # The last period that begins at a missing estimate ends at sample 55. From the missing sample on 0.7 N m are what
     # the input was.
     assert frozen(u, y, monitor(), x) == [57, 58, 59]
-
-
-def test_a_missing_estimate_does_not_hide_a_sensor_that_freezes_in_motion():
-    watching = energy(pendulum(), resolution=[STEP], rest_speed=REST)
-    x = np.tile([0.0, 1.0], (30, 1))  # 1 rad/s are 20 mrad a period
-    x[10, 1] = np.nan
-    found = frozen(np.zeros(30), np.zeros(30), watching, x)
-    assert sorted({*range(1, 30)} - {*found}) == [11]

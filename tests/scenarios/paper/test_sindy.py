@@ -1,4 +1,3 @@
-import importlib
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
@@ -126,26 +125,6 @@ def test_candidates_that_diverge_or_are_too_stiff_are_shown_and_not_chosen(runs)
         assert [c.validation for c in alone.candidates] == [np.inf]  # said, not hidden
 
 
-@needs_pysindy
-def test_a_threshold_that_leaves_nothing_gives_no_acceleration(runs):
-    step = fit_sindy(runs[0], Pendulum(), DT, validation=runs[1], libraries=(GOOD,), thresholds=(10.0,))
-    assert step.text() == ("phi_dot' = 0",)
-    assert step.xdot(torch.tensor([0.3, 2.0]).double(), EMPTY, torch.ones(1).double(), EMPTY).tolist() == [
-        2.0,
-        0.0,
-    ]
-
-
-@needs_pysindy
-def test_terms_that_are_one_on_the_data_are_one_term(runs):
-    twice = Library("twice", (*GOOD.terms, (Factor("phi_dot", scale=2.0),)))
-    one, both = (
-        fit_sindy(runs[0], Pendulum(), DT, validation=runs[1], libraries=(library,))
-        for library in (GOOD, twice)
-    )
-    assert one.text() == both.text()
-
-
 LAW = Library("law", (SINE, V, U, (Factor("phi_dot", "tanh", 5.0), Factor("phi", "abs_cos")), ()))
 VALUES = torch.tensor([[-12.0], [-0.5], [10.0], [-1.0], [0.3]], dtype=torch.float64)
 
@@ -178,10 +157,6 @@ def test_it_exports_at_rounding():
     )
     assert parity.max_abs_error < 1e-12
     assert parity.jacobian_max_abs_error < 1e-12
-
-
-def test_nothing_is_imported_before_it_is_used():
-    assert "pysindy" not in vars(importlib.import_module("scenarios.paper.sindy"))
 
 
 def test_without_pysindy_the_remedy_is_told(runs, monkeypatch):

@@ -53,13 +53,6 @@ def test_the_paper_step_is_explicit_euler_of_what_the_network_says():
     )
 
 
-@pytest.mark.parametrize("use_prior", [False, True])
-def test_features_are_as_many_as_the_form_says(use_prior):
-    prior = Pendulum()
-    step = PaperStep(prior, Copier(slice(0, 2)), SCALES, DT, use_prior=use_prior)
-    assert (step.features(X, U, W).numel(), 2) == PaperStep.sizes(prior, use_prior)
-
-
 def test_euler_feeds_energy_into_a_pendulum_and_the_hybrid_step_does_not():
     """The reason for the hybrid step: the same network, the paper's integrator and ours."""
     prior = Pendulum({"J": 0.1, "mgl": 1.2, "d": 0.0})
