@@ -79,7 +79,7 @@ def is_relative(parameter: Parameter) -> bool:
         (True, False)
     """
     value = parameter.value
-    return value > 0 and parameter.lower >= 0 or value < 0 and parameter.upper <= 0
+    return (value > 0 and parameter.lower >= 0) or (value < 0 and parameter.upper <= 0)
 
 
 def tracked_values(model: HybridModel, tracked: Sequence[TrackedParameter], theta: ca.MX) -> ca.MX:

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.tracking import TrackedParameter, is_relative
@@ -213,7 +213,7 @@ def _pieces(known: Sequence[Trajectory]) -> tuple[list[list[Trajectory]], bool]:
         return [files[name] for name in sorted(files)], False
     (longest,) = [max(part, key=lambda t: len(t.t)) for part in files.values()]
     edges = np.linspace(0, len(longest.t), BLOCKS + 1).astype(int)
-    return [[longest.part(slice(a, b))] for a, b in zip(edges[:-1], edges[1:], strict=True)], True
+    return [[longest.part(slice(a, b))] for a, b in pairwise(edges)], True
 
 
 def _correlation_times(errors: Sequence[Array], n_y: int) -> Array:
