@@ -2,10 +2,10 @@
 
     python benchmarks/tracked.py --data ../shared/data [--machines temperature_lab ...] [--folds 5] [--declared 0.1]
 
-Recordings are left out in the groups of ``benchmarks/no_harm.py``. In each the prior is fitted to the others, which also
-decide which parameters vary and whether tracking them improves predictions. Then two observers of the fitted prior, with
-the same noise, watch what was left out: one tracks these parameters, one does not. At starts a quarter of a horizon
-apart both predict the horizon under the measured inputs. ``ratio`` is the tracking observer's root mean square error
+Recordings are left out in the groups of ``benchmarks/no_harm.py``. In each the prior is fitted to the others, which
+also decide which parameters vary and whether tracking them improves predictions. Then two observers of the fitted
+prior, with the same noise, watch what was left out: one tracks these parameters, one does not. At starts a quarter of a
+horizon apart both predict the horizon under the measured inputs. ``ratio`` is the tracking observer's root mean square error
 over the other's, by output; 1 where nothing is tracked. ``temperature_lab_prbs`` fits to the identification recording
 alone and leaves out the other days. With ``--declared`` the recordings decide nothing: all free parameters are declared
 to vary by this relative standard deviation.
@@ -27,21 +27,12 @@ import numpy as np
 from no_harm import RECORDINGS, folds
 from parts import arguments, report
 
-from hybrid_mpc import InputError, Scenario, Trajectory, fit_prior, load_scenario, load_trajectories
-from hybrid_mpc.data.scales import robust_spread, time_unit
-from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc import InputError, Scenario, fit_prior, load_scenario, load_trajectories
+from hybrid_mpc.compare.tracked import find_tracked, observer_of
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
-from hybrid_mpc.estimate.tuning import process_noise
 from hybrid_mpc.files import read_json, write_json
-from hybrid_mpc.identify.ahead import choose_tracked, errors_ahead
-from hybrid_mpc.identify.delay import lost_samples
-from hybrid_mpc.identify.fit import smoothed
-from hybrid_mpc.identify.prior_model import model_info, prior_programs
+from hybrid_mpc.identify.ahead import errors_ahead
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.varying import find_varying
-from hybrid_mpc.kit.artifact import build_model
-from hybrid_mpc.kit.assembly import make_estimator, tuned_noise
-from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.machine.specification import Window
 from hybrid_mpc.records import plain, record
 
@@ -74,30 +65,6 @@ def other_days(scenario: Scenario, files: Sequence[Path]) -> Scenario:
     return replace(scenario, data=replace(spec, windows=windows))
 
 
-def observer_of(scenario: Scenario, fit: PriorFit, train: Sequence[Trajectory]) -> Filter:
-    """The observer that a run's kit has of the fitted prior."""
-    dt, prior = scenario.data.dt, scenario.prior(fit.values)
-    known = smoothed(scenario.prior, fit, train, dt)
-    spread = {
-        key: tuple(robust_spread(c) for c in np.concatenate([getattr(t, key) for t in known]).T)
-        for key in "xy"
-    }
-    info = replace(
-        model_info(prior, dt), input_delay=fit.delay, time_unit=time_unit(train, dt),
-        state_spread=spread["x"], output_spread=spread["y"],
-    )  # fmt: skip
-    programs = {f"prior/{name}": p for name, p in prior_programs(prior, dt, fit.substeps).items()}
-    model, chosen = build_model("prior", programs, info), scenario.disturbance_model
-    if chosen is None and scenario.control is not None:
-        chosen = default_disturbances(model, scenario.control)
-    model = replace(model, disturbance_model=chosen)
-    late = slice(lost_samples(fit.delay, dt), None)
-    commanded = [replace(t.part(late), x=s.x, xdot=s.xdot) for t, s in zip(train, known, strict=True)]
-    base = process_noise(model, commanded)
-    noise = tuned_noise(model, scenario, base, commanded, observer=True, known=scenario.state_noise)
-    return make_estimator(model, scenario, noise)
-
-
 def row(
     name: str, fold: int, scenario: Scenario, files: list[Path], declared: float, work: Path
 ) -> dict[str, object]:
@@ -125,8 +92,14 @@ def row(
             if not p.fixed
         ]
     else:
-        varying = find_varying(scenario.prior, fit, [*train, *valid], dt=spec.dt, length=length)
-        tracked = choose_tracked(observer, varying, [*train, *valid], horizon, warm_up=spec.warm_up).tracked
+        varying, chosen = find_tracked(scenario, fit, train, valid, length=length, horizon=horizon)
+        print(
+            "  ",
+            {p.name: (p.std, p.alone, p.gain) for p in varying.parameters},
+            chosen.tried,
+            file=sys.stderr,
+        )
+        tracked = chosen.tracked
     seconds = time.process_time() - begun
     held = [t.part(slice(WATCHED)) for t in test]
     before = errors_ahead(observer, held, horizon, warm_up=spec.warm_up).pooled

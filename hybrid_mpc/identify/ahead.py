@@ -159,9 +159,8 @@ class Tracking:
 
 
 def choose_tracked(
-    observer: Filter,
+    watched: Sequence[tuple[Filter, Sequence[Trajectory]]],
     varying: Varying,
-    recordings: Sequence[Trajectory],
     horizon: float,
     *,
     warm_up: float = 0.0,
@@ -170,29 +169,43 @@ def choose_tracked(
 
     Candidates are the parameters whose own variation between recordings has evidence
     (:func:`~hybrid_mpc.identify.varying.find_varying`). They enter one after the other, the best first, as long as the
-    error falls by 3 % and no output's rises by 2 % over that without tracking. All varying parameters together are
+    error falls by 3 % and no output's rises by 2 %. All varying parameters together, and all candidates together, are
     tried, too. A parameter that the user declares as varying is always tracked.
 
     Args:
-        observer: The observer without tracking.
+        watched: Observers without tracking, each with the recordings that it is judged by: best those that its prior
+            was not fitted to. 12 recordings of each at most count, and 1500 periods of each recording.
         varying: Variation of the parameters.
-        recordings: Recordings to judge by; 12 of them at most, and 1500 periods of each.
         horizon: Length [s] of the predictions.
         warm_up: Time [s] that the observer watches before the first prediction. Default: none.
     """
-    parts = [recordings[i].part(slice(WATCHED)) for i in evenly(len(recordings), RECORDINGS)]
-    names = [s.name for s in observer.model.outputs]
-    plain = errors_ahead(observer, parts, horizon, warm_up=warm_up)
-    floor = np.maximum(plain.rmse, 1e-12 * np.maximum(plain.rmse.max(axis=0), 1e-300))
+    parts = [
+        (observer, [own[i].part(slice(WATCHED)) for i in evenly(len(own), RECORDINGS)])
+        for observer, own in watched
+    ]
+    names = [s.name for s in watched[0][0].model.outputs]
+
+    def errors(chosen: Sequence[TrackedParameter]) -> tuple[Array, Array]:
+        """Root mean squares of all recordings ``(r, n_y)``, and numbers of predictions ``(r,)``."""
+        found = [
+            errors_ahead(TrackingFilter(o, chosen) if chosen else o, own, horizon, warm_up=warm_up)
+            for o, own in parts
+        ]
+        return np.concatenate([f.rmse for f in found]), np.concatenate([f.starts for f in found]).astype(
+            float
+        )
+
+    plain, starts = errors(())
+    floor = np.maximum(plain, 1e-12 * np.maximum(plain.max(axis=0), 1e-300))
     tried: dict[str, float] = {}
 
     def judged(chosen: Sequence[TrackedParameter]) -> tuple[float, Array]:
-        """Mean ratio of errors over recordings and outputs, and the pooled one of each output."""
-        found = errors_ahead(TrackingFilter(observer, chosen), parts, horizon, warm_up=warm_up)
-        ratio = np.clip(found.rmse / floor, 1.0 / FAR, FAR)
-        mean = math.exp(float(np.average(np.log(ratio).mean(axis=1), weights=plain.starts)))
+        """Mean ratio of errors over recordings and outputs, and that of each output."""
+        ratio = np.clip(errors(chosen)[0] / floor, 1.0 / FAR, FAR)
+        outputs = np.exp(np.average(np.log(ratio), axis=0, weights=starts))
+        mean = math.exp(float(np.log(outputs).mean()))
         tried[", ".join(one.name for one in chosen)] = mean
-        return mean, np.minimum(found.pooled / plain.pooled, FAR)
+        return mean, outputs
 
     own = [p for p in varying.parameters if p.declared and p.varies]
     best: tuple[TrackedParameter, ...] = tuple(p.tracked() for p in own)
@@ -202,12 +215,13 @@ def choose_tracked(
         for p in varying.parameters
         if not p.declared and p.alone > 0 and p.gain >= WORTH
     }
-    together = tuple(p.tracked() for p in varying.parameters if p.varies)
+    varies = tuple(p.tracked() for p in varying.parameters if p.varies)
+    sets = [varies, (*best, *pool.values())]
     while True:
         have = {one.name for one in best}
         trials = [(*best, one) for name, one in pool.items() if name not in have]
-        if len(together) > 1 and ", ".join(one.name for one in together) not in tried:
-            trials.append(together)
+        trials += [one for one in sets if len(one) > len(best) + 1]
+        sets = []
         found = [(*judged(trial), trial) for trial in trials]
         harmless = [one for one in found if (one[1] <= np.maximum(HARM, HARM * outputs)).all()]
         first = min(harmless, key=lambda one: one[0], default=None)
