@@ -5,10 +5,10 @@
 Recordings are left out in the groups of ``benchmarks/no_harm.py``. In each the prior is fitted to the others, which
 also decide which parameters vary and whether tracking them improves predictions. Then two observers of the fitted
 prior, with the same noise, watch what was left out: one tracks these parameters, one does not. At starts a quarter of a
-horizon apart both predict the horizon under the measured inputs. ``ratio`` is the tracking observer's root mean square error
-over the other's, by output; 1 where nothing is tracked. ``temperature_lab_prbs`` fits to the identification recording
-alone and leaves out the other days. With ``--declared`` the recordings decide nothing: all free parameters are declared
-to vary by this relative standard deviation.
+horizon apart both predict the horizon under the measured inputs. ``ratio`` is the tracking observer's root mean square
+error over the other's, by output; 1 where nothing is tracked. ``temperature_lab_prbs`` fits to the identification
+recording alone and leaves out the other days. With ``--declared`` the recordings decide nothing: all free parameters
+are declared to vary by this relative standard deviation.
 """
 
 from __future__ import annotations

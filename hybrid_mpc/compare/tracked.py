@@ -61,9 +61,9 @@ def find_tracked(
 ) -> tuple[Varying, Tracking]:
     """Find the parameters that vary between recordings, and those of them that an observer should track.
 
-    In turn a group of recordings is left out, the prior is fitted to the others, and its observer is judged by
-    predictions along those that were left out (:func:`~hybrid_mpc.identify.ahead.choose_tracked`). With a single
-    recording the observer of the given fit is judged by that recording.
+    Observers are judged by predictions along the recordings (:func:`~hybrid_mpc.identify.ahead.choose_tracked`): the
+    observer of the given fit, and, in turn, that of a fit without a group of recordings, by these recordings. A single
+    recording has no second set.
 
     Args:
         scenario: Prior, data specification, sensor noise and control problem.
@@ -77,15 +77,21 @@ def find_tracked(
     varying = find_varying(scenario.prior, fit, recordings, dt=spec.dt, length=length)
     files = sorted({t.file for t in recordings})
     groups = [set(files[k::FITS]) for k in range(min(FITS, len(files)))]
-    watched: list[tuple[Filter, Sequence[Trajectory]]] = []
+    held: list[tuple[Filter, Sequence[Trajectory]]] = []
     for out in groups if len(files) > 1 else []:
         kept = [[t for t in part if t.file not in out] for part in (train, valid)]
-        if not kept[0]:
-            continue
-        own = fit_prior(
-            scenario.prior, *kept, dt=spec.dt, length=length, largest_delay=spec.largest_delay,
-            start=fit.values,
-        )  # fmt: skip
-        watched.append((observer_of(scenario, own, kept[0]), [t for t in recordings if t.file in out]))
-    watched = watched or [(observer_of(scenario, fit, train), recordings)]
+        if kept[0]:
+            own = fit_prior(
+                scenario.prior,
+                *kept,
+                dt=spec.dt,
+                length=length,
+                largest_delay=spec.largest_delay,
+                start=fit.values,
+            )
+            held.append((observer_of(scenario, own, kept[0]), [t for t in recordings if t.file in out]))
+    watched: list[list[tuple[Filter, Sequence[Trajectory]]]] = [
+        [(observer_of(scenario, fit, train), recordings)]
+    ]
+    watched += [held] if held else []
     return varying, choose_tracked(watched, varying, horizon, warm_up=spec.warm_up)

@@ -159,7 +159,7 @@ class Tracking:
 
 
 def choose_tracked(
-    watched: Sequence[tuple[Filter, Sequence[Trajectory]]],
+    watched: Sequence[Sequence[tuple[Filter, Sequence[Trajectory]]]],
     varying: Varying,
     horizon: float,
     *,
@@ -169,43 +169,51 @@ def choose_tracked(
 
     Candidates are the parameters whose own variation between recordings has evidence
     (:func:`~hybrid_mpc.identify.varying.find_varying`). They enter one after the other, the best first, as long as the
-    error falls by 3 % and no output's rises by 2 %. All varying parameters together, and all candidates together, are
-    tried, too. A parameter that the user declares as varying is always tracked.
+    error falls by 3 % and no output's rises by 2 %, in each set of evidence. All varying parameters together, and all
+    candidates together, are tried, too. A parameter that the user declares as varying is always tracked.
+
+    Two sets are needed, since either flatters. A prior that was fitted to the very recordings is closer to them than to
+    new ones, so tracking has less to gain. A prior that was fitted to fewer recordings is worse than the one that is
+    used, so tracking has more to gain.
 
     Args:
-        watched: Observers without tracking, each with the recordings that it is judged by: best those that its prior
-            was not fitted to. 12 recordings of each at most count, and 1500 periods of each recording.
+        watched: Sets of evidence. Each has observers without tracking, each with the recordings that it is judged by.
+            12 recordings of an observer at most count, and 1500 periods of each recording.
         varying: Variation of the parameters.
         horizon: Length [s] of the predictions.
         warm_up: Time [s] that the observer watches before the first prediction. Default: none.
     """
-    parts = [
-        (observer, [own[i].part(slice(WATCHED)) for i in evenly(len(own), RECORDINGS)])
-        for observer, own in watched
+    sets = [
+        [(o, [own[i].part(slice(WATCHED)) for i in evenly(len(own), RECORDINGS)]) for o, own in one]
+        for one in watched
     ]
-    names = [s.name for s in watched[0][0].model.outputs]
+    names = [s.name for s in watched[0][0][0].model.outputs]
 
-    def errors(chosen: Sequence[TrackedParameter]) -> tuple[Array, Array]:
+    def errors(
+        evidence: Sequence[tuple[Filter, Sequence[Trajectory]]], chosen: Sequence[TrackedParameter]
+    ) -> tuple[Array, Array]:
         """Root mean squares of all recordings ``(r, n_y)``, and numbers of predictions ``(r,)``."""
         found = [
             errors_ahead(TrackingFilter(o, chosen) if chosen else o, own, horizon, warm_up=warm_up)
-            for o, own in parts
+            for o, own in evidence
         ]
         return np.concatenate([f.rmse for f in found]), np.concatenate([f.starts for f in found]).astype(
             float
         )
 
-    plain, starts = errors(())
-    floor = np.maximum(plain, 1e-12 * np.maximum(plain.max(axis=0), 1e-300))
+    plain = [errors(one, ()) for one in sets]
+    floors = [np.maximum(rmse, 1e-12 * np.maximum(rmse.max(axis=0), 1e-300)) for rmse, _ in plain]
     tried: dict[str, float] = {}
 
     def judged(chosen: Sequence[TrackedParameter]) -> tuple[float, Array]:
-        """Mean ratio of errors over recordings and outputs, and that of each output."""
-        ratio = np.clip(errors(chosen)[0] / floor, 1.0 / FAR, FAR)
-        outputs = np.exp(np.average(np.log(ratio), axis=0, weights=starts))
-        mean = math.exp(float(np.log(outputs).mean()))
+        """Mean ratio of errors over recordings and outputs, and that of each output: the worst of the sets."""
+        outputs = []
+        for one, floor, (_, starts) in zip(sets, floors, plain, strict=True):
+            ratio = np.clip(errors(one, chosen)[0] / floor, 1.0 / FAR, FAR)
+            outputs.append(np.average(np.log(ratio), axis=0, weights=starts))
+        mean = math.exp(float(np.max([o.mean() for o in outputs])))
         tried[", ".join(one.name for one in chosen)] = mean
-        return mean, outputs
+        return mean, np.exp(np.max(outputs, axis=0))
 
     own = [p for p in varying.parameters if p.declared and p.varies]
     best: tuple[TrackedParameter, ...] = tuple(p.tracked() for p in own)
@@ -216,12 +224,12 @@ def choose_tracked(
         if not p.declared and p.alone > 0 and p.gain >= WORTH
     }
     varies = tuple(p.tracked() for p in varying.parameters if p.varies)
-    sets = [varies, (*best, *pool.values())]
+    together = [varies, (*best, *pool.values())]
     while True:
         have = {one.name for one in best}
         trials = [(*best, one) for name, one in pool.items() if name not in have]
-        trials += [one for one in sets if len(one) > len(best) + 1]
-        sets = []
+        trials += [one for one in together if len(one) > len(best) + 1]
+        together = []
         found = [(*judged(trial), trial) for trial in trials]
         harmless = [one for one in found if (one[1] <= np.maximum(HARM, HARM * outputs)).all()]
         first = min(harmless, key=lambda one: one[0], default=None)

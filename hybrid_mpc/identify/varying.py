@@ -309,8 +309,8 @@ def _chosen(
     variances = fixed.copy()
     open_ = [j for j in range(k) if not never[j] and not declared[j]]
     for j in (j for j in open_ if always[j]):
-        std = evidence.best_of_one(variances, j)
-        variances[j] = (std[1] if std[0] > 0 else USUAL) ** 2
+        worth, std = evidence.best_of_one(variances, j)
+        variances[j] = (std if worth > 0 else USUAL) ** 2
     while rest := [j for j in open_ if not variances[j]]:
         trials = [(*evidence.best_of_one(variances, j), j) for j in rest]
         worth, std, best = max(trials)

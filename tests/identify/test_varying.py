@@ -138,7 +138,7 @@ def observer(fit):
 
 def test_predictions_from_the_observer_improve_where_a_parameter_varies():
     fit, found = varying_of(Heater, recorded(GAINS))
-    chosen = choose_tracked([(observer(fit), recorded(GAINS, seed=5))], found, 2.0, warm_up=1.0)
+    chosen = choose_tracked([[(observer(fit), recorded(GAINS, seed=5))]], found, 2.0, warm_up=1.0)
     assert chosen.tracked[0].name == "gain"
     assert chosen.ratio["heat"] < 0.8
     held = recorded([1.4, 2.8], seed=9)
@@ -151,7 +151,7 @@ def test_predictions_from_the_observer_improve_where_a_parameter_varies():
 
 def test_nothing_is_tracked_that_does_not_vary():
     fit, found = varying_of(Heater, recorded([2.0] * 4))
-    chosen = choose_tracked([(observer(fit), recorded([2.0] * 2, seed=5))], found, 2.0)
+    chosen = choose_tracked([[(observer(fit), recorded([2.0] * 2, seed=5))]], found, 2.0)
     assert chosen.tracked == ()
     assert dict(chosen.ratio) == {"heat": 1.0}
 
