@@ -72,14 +72,13 @@ class TrackedParameter:
 
 
 def is_relative(parameter: Parameter) -> bool:
-    """Whether the deviations of a parameter are relative: its bounds have one sign, as those of a time constant.
+    """Whether the deviations of a parameter are relative: its bounds exclude zero, as those of a time constant.
 
     Example:
-        >>> is_relative(Parameter("tau", 2.0, "s", 0.5, 9.0)), is_relative(Parameter("offset", 0.1, "rad", -1.0, 1.0))
+        >>> is_relative(Parameter("tau", 2.0, "s", 0.5, 9.0)), is_relative(Parameter("friction", 0.1, "N", 0.0, 1.0))
         (True, False)
     """
-    value = parameter.value
-    return (value > 0 and parameter.lower >= 0) or (value < 0 and parameter.upper <= 0)
+    return parameter.lower > 0 or parameter.upper < 0
 
 
 def tracked_values(model: HybridModel, tracked: Sequence[TrackedParameter], theta: ca.MX) -> ca.MX:
@@ -99,8 +98,8 @@ def _room(p: Parameter, one: TrackedParameter) -> tuple[float, float]:
         ends = p.value - p.lower, p.upper - p.value
     else:
         low, high = sorted((abs(p.lower), abs(p.upper)))
-        value = abs(p.value)
-        ends = math.log(value / low) if low else FARTHEST, math.log(high / value)
+        value = max(abs(p.value), np.finfo(float).tiny)
+        ends = math.log(value / low) if low else FARTHEST, math.log(high / value) if high else FARTHEST
     down, up = (min(max(end, NEAREST * one.std), 1e3 * one.std) for end in ends)
     return down, up
 

@@ -52,6 +52,7 @@ from hybrid_mpc.workflow.stages.results import (
     identification,
     recordings,
 )
+from hybrid_mpc.workflow.stages.track import TRACK
 from hybrid_mpc.workflow.stages.watch import RATES, WATCH, WatchResult
 from hybrid_mpc.workflow.stages.watching import watching_table
 
@@ -155,7 +156,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
             _response_table(context),
         ],
         "on_model": _on_model_tables(results.on_model),
-        "estimation": [_observer_table(results)],
+        "estimation": [_observer_table(results), _varying_table(context)],
         "timing": [_timing_table(results.timing)],
         "watch": _watch_tables(context),
         "analysis": [_pole_table(results.analysis)],
@@ -594,6 +595,29 @@ def _observer_table(results: Results) -> Table:
     return Table(
         columns, rows, "Innovations on test recordings, without the first 25 samples of each recording."
     )
+
+
+def _varying_table(context: Context) -> Table | None:
+    """Parameters by their variation between recordings; None if nobody asked for it."""
+    found = context.find(TRACK)
+    if isinstance(found, Absent):
+        return None
+    tracked = {one.name for one in found.tracking.tracked}
+    rows = [
+        (f"{p.name} [{p.unit}]", _number(p.value), _number(p.std) if p.std else "fixed", _number(p.gain),
+         "yes" if p.name in tracked else "no")
+        for p in found.varying.parameters
+    ]  # fmt: skip
+    of = "blocks of the recording" if found.varying.blocks else "recordings"
+    ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in found.tracking.ratio.items())
+    gain = (
+        f" Prediction errors over {found.tracking.horizon:g} s with tracking, over those without: {ratios}."
+    )
+    return Table(
+        ("parameter", "fitted", "standard deviation", "evidence", "tracked"), rows,
+        f"Variation of the parameters between {found.varying.pieces} {of}; evidence is the gain of log evidence over a "
+        f"fixed parameter.{gain if tracked else ' Tracking improves no prediction.'}",
+    )  # fmt: skip
 
 
 def _timing_table(timing: Timing) -> Table | None:
