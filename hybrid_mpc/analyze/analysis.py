@@ -1,7 +1,7 @@
-"""The linear analysis of an artifact's models: what ``hybrid-mpc analyze`` computes.
+"""The linear analysis of an artifact's models, which ``hybrid-mpc analyze`` computes.
 
-:func:`analysis_input` reads the artifact, the scenario and recordings; :func:`analyze_models` computes part after part.
-A part that cannot be computed is a :class:`Missing` with its reason.
+:func:`analyze_models` computes one part after the other. A part that cannot be computed is a :class:`Missing` with its
+reason.
 """
 
 from __future__ import annotations
@@ -79,29 +79,35 @@ Point = tuple[Array, Array]
 """A state ``(n_x,)`` and a hidden state ``(n_h,)``."""
 
 POINTS = ("rest", "working", "moving", "driven")
-"""Linearizations: the tangent at rest, the describing function of motions of working size around it, the tangent in
-motion at working speed, and the mean along a driven run. Only mechanical models have the two in the middle."""
+"""Linearizations: tangent at rest; describing function of motions of working size; tangent in motion at working speed;
+mean along a driven run. Only mechanical models have ``"working"`` and ``"moving"``."""
 LARGEST_ZERO = 1e6
-"""Zeros beyond this size stand for a delay of the system: rounding, over the fall of its gain."""
+"""Zeros larger than this are rounding errors: zeros at infinity (of a delay) that are computed as finite."""
 LEVEL = 0.5
 """Amplitude of the multisine over half the input's range."""
 PERIOD, PERIODS, BAND = 20.0, 4, (0.1, 3.0)
-"""The multisine for frequency responses: its period [time units], periods that count, and band [1 over
-these]."""
+"""Multisine for frequency responses: its period [time units], number of counted periods, and band [1 / time unit]."""
 DRIVEN, DRIVEN_BAND = 30.0, (0.1, 1.5)
-"""A driven run: its length [time units] and band [1 over these]."""
+"""Driven run: its length [time units], and the band of its multisine [1 / time unit]."""
 POSITIONS = 21
 """Positions of the gain schedule."""
 
 
 @dataclass(frozen=True)
 class AnalysisInput:
-    """What is analyzed: models by name (``"prior"`` and ``"hybrid"`` are compared), and their surroundings.
+    """Models to analyze, and data about their machine.
 
-    ``programs`` are by ``"prior/step"``, ``filters`` by model and mode, ``("hybrid", "quiet")``. ``x_range`` and
-    ``u_range`` are working ranges ``(n, 2)``, ``speed`` is ``(n_x / 2,)``, empty for a machine without speeds.
-    Recordings are inputs ``(n,)``, outputs
-    ``(n,)`` and first states. Points of rest are looked for in ``region`` ``(n_x, 2)``, by default ``x_range``.
+    Args:
+        models: Models by name; ``"prior"`` and ``"hybrid"`` are compared.
+        programs: Exported programs by ``"MODEL/step"``.
+        x_range: Working range of the states ``(n_x, 2)``.
+        u_range: Working range of the inputs ``(n_u, 2)``.
+        speed: Working speeds ``(n_x / 2,)``; empty for a machine without speeds.
+        ocp: Control problem. Default: none.
+        filters: Observers by model and mode, ``("hybrid", "quiet")``. Default: none.
+        plant: Simulated machine. Default: none.
+        recordings: Inputs ``(n,)``, outputs ``(n,)`` and initial state of each recording. Default: none.
+        region: Region in which equilibria are searched ``(n_x, 2)``. Default: ``x_range``.
     """
 
     models: Mapping[str, HybridModel]
@@ -118,14 +124,14 @@ class AnalysisInput:
 
 @dataclass(frozen=True)
 class Missing:
-    """Why a part could not be computed."""
+    """Reason why a part could not be computed."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class FrictionAnalysis:
-    """Damping of a model's first axis: over the size of the motion, and at the working speed ``(1,)``."""
+    """Damping of a model's first axis: over the amplitude of the speed, and at the working speed ``(1,)``."""
 
     slopes: FrictionSlopes
     working: FrictionSlopes
@@ -133,7 +139,7 @@ class FrictionAnalysis:
 
 @dataclass(frozen=True)
 class Reduction:
-    """A linearization reduced to its physical states; ``bound`` is the largest difference of the responses."""
+    """A linearization reduced to its physical states; ``bound`` is an upper bound of the error of its response."""
 
     a: Array
     b: Array
@@ -144,10 +150,17 @@ class Reduction:
 
 @dataclass(frozen=True)
 class Linearization:
-    """One linearization of a model: modes, poles (largest first), zeros of a square system, responses.
+    """One linearization of a model.
 
-    The unit step responses ``step`` are ``(n_y, n_u, k)`` at the times ``t`` [s]. ``reduced`` is None without hidden
-    states.
+    Args:
+        structure: Modes with their controllability and observability.
+        poles: Poles, largest first.
+        zeros: Zeros of a system with as many inputs as outputs, else empty.
+        response: Frequency response.
+        t: Times of the step responses ``(k,)`` [s].
+        step: Unit step responses ``(n_y, n_u, k)``.
+        reduced: Reduction to the physical states; None for a model without hidden states.
+        gain: Steady-state gain.
     """
 
     structure: Structure
@@ -162,7 +175,7 @@ class Linearization:
 
 @dataclass(frozen=True)
 class ResponseError:
-    """Relative distance of two frequency responses: median and largest over frequencies."""
+    """Relative difference of two frequency responses: median and maximum over the frequencies."""
 
     median: float
     largest: float
@@ -170,9 +183,9 @@ class ResponseError:
 
 @dataclass(frozen=True)
 class ResponseAnalysis:
-    """Responses of machine and models to the same inputs, and each model's distance from the machine.
+    """Responses of machine and models to the same inputs, and the error of each model's response.
 
-    ``left_out`` says of a model without one why: its free run diverges.
+    ``left_out`` holds the reason for each model without a response, for example a diverging free run.
     """
 
     source: str
@@ -184,7 +197,7 @@ class ResponseAnalysis:
 
 @dataclass(frozen=True)
 class ScheduleAnalysis:
-    """LQR gains over the working range: tangent at rest, friction of working size, and positions nothing holds."""
+    """LQR gains over the working range: tangent at rest, friction of working size, and positions no input holds."""
 
     rest: GainSchedule
     working: GainSchedule
@@ -193,12 +206,17 @@ class ScheduleAnalysis:
 
 @dataclass(frozen=True)
 class LoopAnalysis:
-    """A controller and a filter around a linearized machine.
+    """A loop of controller, filter and linearized machine, broken at one input with the others closed.
 
-    ``gain`` is the controller's by the physical states ``(n_u, n_x)``, ``open_loop`` the loop gain ``(n,)`` in negative
-    feedback at ``omega`` [rad/s], broken at one input with the others closed. A loop that is not stable has no margins,
-    no sensitivities at that input (``"S"``, ``"T"`` ``(n,)``, ``"KS"``, ``"GS"`` ``(n_y, n)``) and no peaks (of ``"S"``
-    and ``"T"``).
+    Args:
+        stable: Whether all closed-loop poles are inside the unit circle.
+        radius: Spectral radius of the closed loop.
+        gain: Gain of the controller from the physical states ``(n_u, n_x)``.
+        omega: Frequencies ``(n,)`` [rad/s].
+        open_loop: Loop gain ``(n,)``, for negative feedback.
+        margins: Stability margins; None for an unstable loop.
+        sensitivity: ``"S"`` and ``"T"`` ``(n,)``, ``"KS"`` and ``"GS"`` ``(n_y, n)``; empty for an unstable loop.
+        peaks: Largest magnitudes of ``"S"`` and ``"T"``; empty for an unstable loop.
     """
 
     stable: bool
@@ -213,7 +231,7 @@ class LoopAnalysis:
 
 @dataclass(frozen=True)
 class MemoryAnalysis:
-    """Whether a model forgets where it began: exponents of the whole state and of the hidden one, certificate."""
+    """Whether a model forgets its initial state: exponents of the whole and of the hidden state, and a certificate."""
 
     whole: LyapunovExponent
     hidden: LyapunovExponent | None
@@ -222,10 +240,15 @@ class MemoryAnalysis:
 
 @dataclass(frozen=True)
 class SensitivityAnalysis:
-    """A driven run's derivatives by the prior's parameters.
+    """Derivatives of a driven run with respect to the prior's parameters.
 
-    ``relative`` is the change of the states per 100 % of each parameter ``(n, n_x, n_p)``, ``rms`` its root mean square
-    over the run. ``identifiable`` are the parameters that the run tells apart, ``correlation`` is that of their errors.
+    Args:
+        parameters: Names of the parameters ``(n_p,)``.
+        t: Times ``(n,)`` [s].
+        relative: Change of the states per 100 % change of each parameter ``(n, n_x, n_p)``.
+        rms: Root mean square of ``relative`` over the run ``(n_x, n_p)``.
+        identifiable: Parameters that are identifiable together from this run.
+        correlation: Correlation of the errors of the identifiable parameters.
     """
 
     parameters: tuple[str, ...]
@@ -238,10 +261,10 @@ class SensitivityAnalysis:
 
 @dataclass(frozen=True)
 class AnalysisResult:
-    """The parts of an analysis, each by model; linearizations also by point of :data:`POINTS`.
+    """The parts of an analysis, by model; linearizations also by point of :data:`POINTS`.
 
-    Loops are by ``"prior on hybrid"`` (controller on machine), point, and mode of the filter with, where there are
-    several, the input at which the loop is broken: ``"quiet"``, or ``"quiet at heater_1"``.
+    Keys of ``loops``: controller and machine (``"prior on hybrid"``), point, and mode of the filter. With several
+    inputs, the mode also names the input at which the loop is broken: ``"quiet at heater_1"``.
     """
 
     equilibria: Mapping[str, Equilibria] | Missing
@@ -255,8 +278,9 @@ class AnalysisResult:
 
 
 def state_range(model: HybridModel, control: OCP | None = None) -> Array:
-    """Range of the states ``(n_x, 2)``: limits of the control problem, else the signals', else a unit (half a turn) to
-    either side of the operating point.
+    """Range of the states ``(n_x, 2)``: limits of the control problem, else the signals' limits.
+
+    An open side lies one unit (half a turn for a periodic state) from the operating point.
     """
     none = np.full(model.n_x, np.inf)
     lower, upper = (-none, none) if control is None else control.state_range
@@ -265,7 +289,10 @@ def state_range(model: HybridModel, control: OCP | None = None) -> Array:
 
 
 def input_range(model: HybridModel, control: OCP | None) -> Array:
-    """Range of the inputs ``(n_u, 2)``: limits of the control problem, else the signals', else a unit."""
+    """Range of the inputs ``(n_u, 2)``: limits of the control problem, else the signals' limits.
+
+    An open side lies one input scale (without a control problem one unit) from the operating point.
+    """
     if control is None:
         return np.array(
             [_within(s, 1.0, at=at) for s, at in zip(model.inputs, model.u0.tolist(), strict=True)]
@@ -279,8 +306,9 @@ def input_range(model: HybridModel, control: OCP | None) -> Array:
 def _within(
     signal: Signal, size: float, lower: float = -np.inf, upper: float = np.inf, at: float = 0.0
 ) -> tuple[float, float]:
-    """Finite limits of a signal, else its own; an open side ends ``size`` from ``at``, at least so far from the other
-    side.
+    """Finite limits of a signal: those given, else its own; an open side lies ``size`` from ``at``.
+
+    The distance of an open side from the other side is at least ``size``.
     """
     low = lower if np.isfinite(lower) else signal.lower
     high = upper if np.isfinite(upper) else signal.upper
@@ -296,7 +324,7 @@ Report = Callable[[str, int, int, str], None]
 
 
 def analyze_models(given: AnalysisInput, report: Report = lambda *text: None) -> AnalysisResult:
-    """Analyze the models, part after part; a part that cannot be computed says why.
+    """Analyze the models, one part after the other; a part that cannot be computed is its reason.
 
     ``report`` is called with ``("parts", done, total, part)``.
     """
@@ -314,12 +342,12 @@ def analyze_models(given: AnalysisInput, report: Report = lambda *text: None) ->
     found: dict[str, Any] = {}
     for number, (name, compute) in enumerate(parts.items()):
         report("parts", number, len(parts), name)
-        found[name] = _tried(compute)
+        found[name] = _try(compute)
     return AnalysisResult(**found)
 
 
-def _tried(compute: Callable[[], R]) -> R | Missing:
-    """What is computed, or why it cannot be."""
+def _try(compute: Callable[[], R]) -> R | Missing:
+    """Compute a part; :class:`Missing` with the reason if an InputError prevents it."""
     try:
         return compute()
     except InputError as error:
@@ -327,8 +355,9 @@ def _tried(compute: Callable[[], R]) -> R | Missing:
 
 
 def resting_point(given: AnalysisInput, model: HybridModel) -> Point:
-    """The point of rest under the operating point's input that is nearest to it, stable ones first; the operating point
-    itself where none is found.
+    """Nearest equilibrium to the operating point under its input, a stable one if there is one.
+
+    The operating point itself if there is no equilibrium.
     """
     size = given.x_range[:, 1] - given.x_range[:, 0]
     found = equilibria(model, model.u0, pairs(given.x_range), starts=16).points
@@ -340,13 +369,14 @@ def resting_point(given: AnalysisInput, model: HybridModel) -> Point:
 
 
 def pairs(box: Array) -> list[tuple[float, float]]:
-    """Rows of a box as pairs."""
+    """Convert the rows of a box ``(n, 2)`` to pairs."""
     return [(float(a), float(b)) for a, b in box]
 
 
 def driving_input(given: AnalysisInput, model: HybridModel, seconds: float) -> Array:
-    """A multisine ``(n, n_u)`` of working size around the middle of each input's range, over so many of the machine's
-    seconds; each input has lines of its own.
+    """Multisine ``(n, n_u)`` of working size around the middle of each input's range.
+
+    ``seconds`` is its length in the machine's time units. Each input has its own frequencies.
     """
     unit = machine_second(model.dt, model.time_unit)
     t = np.asarray(model.dt * np.arange(round(seconds * unit / model.dt)), dtype=np.float64)
@@ -356,13 +386,13 @@ def driving_input(given: AnalysisInput, model: HybridModel, seconds: float) -> A
 
 
 def equilibria_of(given: AnalysisInput) -> dict[str, Equilibria]:
-    """Points of rest of each model in the whole range of the states."""
+    """Equilibria of each model in the whole range of the states."""
     region = given.x_range if given.region is None else given.region
     return {name: equilibria(model, model.u0, pairs(region)) for name, model in given.models.items()}
 
 
 def friction_of(given: AnalysisInput, points: Mapping[str, Point]) -> dict[str, FrictionAnalysis]:
-    """Damping at rest, of motions of a size, and in motion."""
+    """Damping at rest, for motions of several amplitudes, and in motion, by model."""
     found = {}
     for name, model in given.models.items():
         q, work = points[name][0][: positions_of(model)], float(given.speed[0])
@@ -409,14 +439,15 @@ def _linearization(given: AnalysisInput, model: HybridModel, point: Point, syste
         frequency_response(system, omega),
         t,
         np.reshape(step, (model.n_y, model.n_u, -1)),
-        _tried(lambda: _reduced(given, model, point, system, omega)) if model.n_h else None,
-        _tried(lambda: steady_gain(system)),
+        _try(lambda: _reduced(given, model, point, system, omega)) if model.n_h else None,
+        _try(lambda: steady_gain(system)),
     )
 
 
 def _scaled(given: AnalysisInput, model: HybridModel, system: Any) -> Any:
-    """A system with inputs and outputs over their working ranges, so that those of several units can be put together:
-    an output's range is what those of the states, and of the inputs, make of it.
+    """Scale a system's inputs and outputs by their working ranges, so that signals of different units are comparable.
+
+    The range of an output is ``|C| (range of x) + |D| (range of u)``.
     """
     half_x, half_u = (0.5 * (box[:, 1] - box[:, 0]) for box in (given.x_range, given.u_range))
     a, b, c, d = (np.asarray(m) for m in (system.A, system.B, system.C, system.D))
@@ -428,7 +459,7 @@ def _scaled(given: AnalysisInput, model: HybridModel, system: Any) -> Any:
 
 
 def _zeros(system: Any) -> Complex:
-    """Zeros of a square system without those that only rounding keeps from infinity."""
+    """Finite zeros of a system with as many inputs as outputs."""
     found = np.asarray(system.zeros(), dtype=np.complex128)
     return found[np.abs(found) < LARGEST_ZERO]
 
@@ -444,7 +475,7 @@ def _reduced(given: AnalysisInput, model: HybridModel, point: Point, system: Any
 
 
 def responses_of(given: AnalysisInput) -> ResponseAnalysis:
-    """Responses of machine and models to the same inputs: of recordings, else of the simulated plant."""
+    """Responses of machine and models to the same inputs, from recordings, else from the simulated plant."""
     models = given.models
     some = next(iter(models.values()))
     unit = machine_second(some.dt, some.time_unit)
@@ -482,7 +513,7 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
             "responses: neither a recording nor a simulated machine is available; give --data FILE"
             " [HM-ANALYZE-002]"
         )
-    tried = {name: _tried(partial(response, model)) for name, model in models.items()}
+    tried = {name: _try(partial(response, model)) for name, model in models.items()}
     responses = {name: one for name, one in tried.items() if not isinstance(one, Missing)}
     errors = {name: _response_error(one, machine) for name, one in responses.items()}
     left_out = {name: one.reason for name, one in tried.items() if isinstance(one, Missing)}
@@ -490,7 +521,7 @@ def responses_of(given: AnalysisInput) -> ResponseAnalysis:
 
 
 def _response_error(model: MeasuredResponse, machine: MeasuredResponse) -> ResponseError:
-    """Distance of a model's response where the machine's own is clean."""
+    """Error of a model's response at frequencies where the machine's coherence is above 0.8."""
     clean = (machine.coherence > 0.8) & np.isfinite(machine.response) & np.isfinite(model.response)
     if not clean.any():
         raise InputError(
@@ -524,7 +555,10 @@ def schedules_of(given: AnalysisInput) -> dict[str, ScheduleAnalysis]:
 
 
 def _held(model: HybridModel, positions: Array) -> tuple[list[tuple[Array, Array]], list[float]]:
-    """Points of rest at positions, outwards from zero, each begun at its neighbour's input; and those without one."""
+    """Equilibria at the positions, and the positions without one.
+
+    The search goes outwards from zero; each position starts with the input of its nearest solved neighbour.
+    """
     found: dict[float, Array] = {}
     lost: list[float] = []
     for q in sorted(positions.tolist(), key=abs):
@@ -543,7 +577,7 @@ def _held(model: HybridModel, positions: Array) -> tuple[list[tuple[Array, Array
 def loops_of(
     given: AnalysisInput, points: Mapping[str, Point]
 ) -> dict[str, dict[str, dict[str, LoopAnalysis]]]:
-    """Each model's controller and filter around itself, and the prior's around the hybrid."""
+    """Loops of each model's controller and filter with the model itself, and of the prior's with the hybrid."""
     if given.ocp is None or not given.filters:
         raise InputError(
             "loops: the scenario's control problem or the observers' noise is missing; run the scenario with "
@@ -570,7 +604,7 @@ def loops_of(
 
 
 def at_input(model: HybridModel, signal: Signal) -> str:
-    """What says at which input a loop is broken; nothing of the only one."""
+    """Text that names the input at which a loop is broken; empty for a single input."""
     return f" at {signal.name}" if model.n_u > 1 else ""
 
 
@@ -595,7 +629,7 @@ def _loop(loop: LinearLoop, j: int, gain: Array, dt: float, unit: float) -> Loop
 
 
 def _seen(model: HybridModel) -> NDArray[np.bool_]:
-    """Which states ``(n_x,)`` an output of the operating point depends on."""
+    """Mask ``(n_x,)`` of the states that an output depends on at the operating point."""
     x = ca.MX.sym("x", model.n_x)
     slope = ca.Function("C", [x], [ca.jacobian(model.output(x, model.u0, model.w, model.p), x)])
     return np.asarray(np.any(slope(model.x0).full() != 0, axis=0))
@@ -611,7 +645,7 @@ def memory_of(given: AnalysisInput) -> dict[str, MemoryAnalysis]:
             found[name] = MemoryAnalysis(whole, None, None)
             continue
         hidden = lyapunov_exponent(model, model.x0, u, part="hidden")
-        certificate = _tried(partial(_certificate, given, given.programs[f"{name}/step"]))
+        certificate = _try(partial(_certificate, given, given.programs[f"{name}/step"]))
         found[name] = MemoryAnalysis(whole, hidden, certificate)
     return found
 
@@ -621,7 +655,7 @@ def _certificate(given: AnalysisInput, program: Program) -> Contraction:
 
 
 def sensitivities_of(given: AnalysisInput) -> dict[str, SensitivityAnalysis]:
-    """A driven run's derivatives by the prior's parameters."""
+    """Derivatives of a driven run with respect to the prior's parameters, by model."""
     made = {}
     for name, model in given.models.items():
         found = parameter_sensitivities(model, model.x0, driving_input(given, model, 10.0))

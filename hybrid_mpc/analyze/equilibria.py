@@ -1,4 +1,4 @@
-"""All equilibria of a region, and their stability."""
+"""Equilibria of a model within a region, and their stability."""
 
 from __future__ import annotations
 
@@ -23,20 +23,27 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 STARTS = 64
 SETTLES = 100
-"""Periods in which a hidden state settles at most before a search begins."""
+"""Maximum number of periods in which a hidden state settles before a search begins."""
 SAME = 1e-5
-"""Distance, over the region's size, below which two solutions are one: Newton's own error is the residual of 1e-10
-over the slowest mode's distance from 1, far below it."""
+"""Distance, over the region's size, below which two solutions are the same equilibrium. The error of Newton's method is
+far smaller: the residual of 1e-10 over the distance of the slowest mode from 1."""
 MARGINAL = 1e-7
-"""Eigenvalues closer to the unit circle than this are on it as far as rounding can tell."""
+"""Distance of an eigenvalue from the unit circle that is within rounding errors."""
 
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A point of rest: its residual is the largest change in one step, its poles are those of the step, largest first.
+    """An equilibrium under a held input.
 
-    ``stability`` is ``"stable"``, ``"unstable"`` or ``"marginal"`` (an eigenvalue on the unit circle: a continuum of
-    points of rest, or a stability that no linearization tells). ``hits`` counts the starts that ended here.
+    Args:
+        x: State ``(n_x,)``.
+        h: Hidden state ``(n_h,)``.
+        u: Input ``(n_u,)``.
+        residual: Largest change of a state in one step.
+        poles: Eigenvalues of the step's Jacobian ``(n_x + n_h,)``, largest first.
+        stability: ``"stable"``, ``"unstable"`` or ``"marginal"``. Marginal: an eigenvalue lies on the unit circle, so
+            there is a continuum of equilibria, or the linearization does not determine the stability.
+        hits: Number of starts that converged to this equilibrium.
     """
 
     x: Array
@@ -50,11 +57,14 @@ class Equilibrium:
 
 @dataclass(frozen=True)
 class Equilibria:
-    """What Newton's method found from many starts: points in order of their states.
+    """Equilibria that Newton's method found from many starts.
 
-    ``converged`` starts ended at a point of rest inside the region. ``unseen`` is the estimated probability that a
-    further one finds a new point: the share of points that were hit only once (Good and Turing); 1 where nothing was
-    found.
+    Args:
+        points: The equilibria, sorted by their states.
+        starts: Number of starts.
+        converged: Number of starts that converged to an equilibrium inside the region.
+        unseen: Estimated probability that one more start finds a new equilibrium (Good and Turing): number of
+            equilibria with one hit over ``converged``; 1 if nothing was found.
     """
 
     points: tuple[Equilibrium, ...]
@@ -70,11 +80,11 @@ def equilibria(
     *,
     starts: int = STARTS,
 ) -> Equilibria:
-    """Points of rest ``(x, h)`` under a held input with ``x`` in a region, by Newton's method from many starts.
+    """Search equilibria ``(x, h)`` under a held input with ``x`` in a region, by Newton's method from many starts.
 
-    Starts fill the region evenly (a Sobol sequence, the same in every call), each with the hidden state that settles
-    there. Points of signals that are ``periodic`` count modulo a turn. No such search can prove that there are no
-    others; ``unseen`` says how likely one is to turn up.
+    Starts fill the region evenly (a Sobol sequence, the same in every call). Each start has the hidden state that
+    settles there. States that are ``periodic`` count modulo a turn. The search cannot prove that there are no other
+    equilibria; ``unseen`` estimates their probability.
 
     Args:
         model: The model.
@@ -107,7 +117,7 @@ def equilibria(
         )
     if starts < 1:
         raise InputError(f"equilibria: give at least one start, got {starts} [HM-ANALYZE-009]")
-    from scipy.stats import qmc  # a second of start-up that few need
+    from scipy.stats import qmc  # importing it takes about a second, so only this function imports it
 
     size = box[:, 1] - box[:, 0]
     search = rest_search(model, np.concatenate([size, natural_sizes(model)[model.n_x :]]))
@@ -118,7 +128,7 @@ def equilibria(
     for start in box[:, 0] + (unit + 0.5 / starts) % 1.0 * size:
         v = np.concatenate([start, hidden_fixed_point(model, start, held, limit=SETTLES), held])
         end = search.descend(v, none).v
-        z, error = _turned(model, end[:n_z], box), residual_of(search, end)
+        z, error = _move_by_turns(model, end[:n_z], box), residual_of(search, end)
         x = z[: model.n_x]
         edge = SAME * size
         if not error <= RESIDUAL or np.any(x < box[:, 0] - edge) or np.any(x > box[:, 1] + edge):
@@ -150,8 +160,8 @@ def _point(model: HybridModel, z: Array, error: float, hits: int, u: Array) -> E
     return Equilibrium(x, h, u, error, poles, stability, hits)
 
 
-def _turned(model: HybridModel, z: Array, box: Array) -> Array:
-    """Periodic states moved by whole turns into the region, where they can be."""
+def _move_by_turns(model: HybridModel, z: Array, box: Array) -> Array:
+    """Move periodic states by whole turns into the region, if possible."""
     turned = z.copy()
     for i, signal in enumerate(model.states):
         if signal.periodic and np.isfinite(z[i]):
@@ -160,6 +170,7 @@ def _turned(model: HybridModel, z: Array, box: Array) -> Array:
 
 
 def _apart(model: HybridModel, difference: Array) -> Array:
+    """Absolute difference of states ``(n_x,)``; periodic states modulo a turn."""
     turns = np.array([s.periodic for s in model.states])
     around = np.abs((difference + np.pi) % (2 * np.pi) - np.pi)
     return np.where(turns, around, np.abs(difference))

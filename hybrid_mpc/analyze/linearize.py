@@ -1,4 +1,4 @@
-"""Linear models of a nonlinear one: at a point, at a size of motion (friction), along a trajectory."""
+"""Linearizations of a model: at a point, for friction at an amplitude of motion, and along a trajectory."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from hybrid_mpc.model.model import HybridModel, positions_of
 Array = NDArray[np.float64]
 Kind: TypeAlias = Literal["secant", "harmonic"]
 ANGLES = 64
-"""Points of a sinusoid's period over which the harmonic mean is taken; exact for polynomials of degree 62."""
+"""Points of a sinusoid's period at which the describing function is evaluated; exact for polynomials of degree 62."""
 
 
 def control_toolbox() -> Any:
-    """The module ``control``; an InputError says how to install it where it is missing."""
+    """Import python-control; an InputError says how to install it if it is missing."""
     with named_extra("linear analysis"):
         import control
     return control
 
 
 def period(sys: Any) -> float:
-    """Period [s] of a discrete system; an InputError for a continuous one."""
+    """Period [s] of a discrete system; InputError for a continuous system."""
     dt = sys.dt
     if dt is None or dt is True or not dt > 0:
         raise InputError(
@@ -40,23 +40,23 @@ def period(sys: Any) -> float:
 def operating_point(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None
 ) -> tuple[Array, Array, Array]:
-    """``x`` ``(n_x,)``, ``u`` ``(n_u,)`` and ``h`` ``(n_h,)``, checked; default of ``h``: its equilibrium."""
+    """Check ``x`` ``(n_x,)``, ``u`` ``(n_u,)`` and ``h`` ``(n_h,)``; default of ``h``: its equilibrium."""
     x0, u0 = vector(x, model.n_x, "x"), vector(u, model.n_u, "u")
     return x0, u0, hidden_equilibrium(model, x0, u0) if h is None else vector(h, model.n_h, "h")
 
 
 def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
-    """``(x, h, u) -> (A, B, C, D)`` of ``z = (x, h)``, exact, as a function that can be differentiated again.
+    """Exact Jacobians ``(x, h, u) -> (A, B, C, D)`` over ``z = (x, h)``, as a function that is differentiable again.
 
     Args:
         model: The model.
-        continuous: Of ``xdot`` instead of the step; needs a model without hidden state. Default: no.
+        continuous: True: Jacobians of ``xdot`` instead of the step; the model has no hidden state. Default: False.
 
     Returns:
         ``A`` ``(n_z, n_z)``, ``B`` ``(n_z, n_u)``, ``C`` ``(n_y, n_z)``, ``D`` ``(n_y, n_u)``, all dense.
 
     Raises:
-        InputError: If the continuous form of a model with hidden state is asked for: that lives in steps of ``dt``.
+        InputError: If ``continuous`` is requested for a model with hidden state, which is discrete with period ``dt``.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal
@@ -89,21 +89,21 @@ def jacobians(model: HybridModel, *, continuous: bool = False) -> ca.Function:
 def linearize(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None, *, continuous: bool = False
 ) -> Any:
-    """State space of small deviations around ``(x, h, u)``, from exact derivatives.
+    """Linearize a model at ``(x, h, u)`` with exact derivatives.
 
     Args:
         model: The model.
         x: Operating point ``(n_x,)``; it need not be an equilibrium.
         u: Input ``(n_u,)``.
         h: Hidden state ``(n_h,)``. Default: its equilibrium while ``x`` and ``u`` are held.
-        continuous: The ODE itself instead of its step, where there is no hidden state. Default: no.
+        continuous: True: linearize the ODE instead of its step; the model must have no hidden state. Default: False.
 
     Returns:
         ``control.StateSpace`` with period ``model.dt`` (0 if continuous) over the states ``[x; h]``; no state is
         removed.
 
     Raises:
-        InputError: If a size is wrong, the hidden state finds no rest, or python-control is not installed.
+        InputError: If a size is wrong, the hidden state has no equilibrium, or python-control is not installed.
 
     Example:
         ``control.damp(linearize(model, x, u))``
@@ -114,7 +114,7 @@ def linearize(
 
 
 def _state_space(model: HybridModel, *matrices: Array, dt: float | None = None) -> Any:
-    """``control.StateSpace`` over ``[x; h]`` with the signals' names; names that occur several times are numbered."""
+    """``control.StateSpace`` over ``[x; h]`` with the signals' names; repeated names are numbered."""
     names = [s.name for s in model.outputs]
     return control_toolbox().ss(
         *matrices, model.dt if dt is None else dt, remove_useless_states=False, name=model.name,
@@ -125,23 +125,24 @@ def _state_space(model: HybridModel, *matrices: Array, dt: float | None = None) 
 
 
 def linearize_at_speed(model: HybridModel, q: ArrayLike, v_work: ArrayLike, u: ArrayLike) -> Any:
-    """Linearization with friction as it is at working speed, at ``x = (q, v_work)``.
+    """Linearize a mechanical model in motion, at ``x = (q, v_work)``.
 
-    At rest the slope of a smoothed Coulomb friction ``tanh(v / v_s)`` is a huge viscous damper that no motion feels. At
-    ``|v_work|`` of several ``v_s`` the slope is that of the motion. The point is no equilibrium: the result describes
-    small deviations from the motion over times short against it. Compare models at the same ``(q, v_work, u)``.
+    At rest, smoothed Coulomb friction ``tanh(v / v_s)`` has a very steep slope, which is only valid for ``|v| << v_s``.
+    At several ``v_s``, the slope is that of the motion. The point is not an equilibrium: the result describes small
+    deviations from the motion, over times that are short compared with the motion. Compare models at the same
+    ``(q, v_work, u)``.
 
     Args:
         model: The model, state ``[q, v]``.
         q: Positions ``(n_x / 2,)``.
         v_work: Working speeds ``(n_x / 2,)``.
-        u: Input ``(n_u,)`` there.
+        u: Input ``(n_u,)`` at that point.
 
     Returns:
         ``control.StateSpace`` as from :func:`linearize`.
 
     Raises:
-        InputError: If a size is wrong or the hidden state finds no rest.
+        InputError: If a size is wrong, or the hidden state has no equilibrium.
     """
     n_q = positions_of(model)
     x = np.concatenate([vector(q, n_q, "q"), vector(v_work, n_q, "v_work")])
@@ -152,27 +153,30 @@ def linearize_secant(
     model: HybridModel, x: ArrayLike, u: ArrayLike, speed: ArrayLike, h: ArrayLike | None = None,
     *, kind: Kind = "harmonic",
 ) -> Any:  # fmt: skip
-    """Linearization at rest whose damping is that of motions of a given size.
+    """Linearize a mechanical model at rest, with the damping of motions of a given amplitude.
 
-    The columns of A by the velocities are chords: of the step from ``v = +speed`` and ``-speed`` (``"secant"``), or
-    the mean over a sinusoid of that amplitude (``"harmonic"``, the describing function; 4/pi of the secant for Coulomb
-    friction). All other columns are means of the tangents over the same motion, of all axes in phase: friction at rest
-    that brakes within less than a period would brake what positions and inputs do, too. The point stays a point of
-    rest, so poles, loops and margins of it mean something.
+    Velocity columns of A: with ``"secant"`` the slope of the step between ``v = +speed`` and ``-speed``; with
+    ``"harmonic"`` the describing function of a sinusoid of that amplitude (4/pi times the secant for Coulomb friction).
+
+    All other columns are means of the tangents over the same motion, with all axes in phase. The tangent at rest would
+    be wrong for these columns: friction that stops a motion within less than a period also removes the effect of
+    positions and inputs. The point remains an equilibrium, so poles, loops and margins are defined.
 
     Args:
         model: The model, state ``[q, v]``.
         x: Operating point ``(n_x,)``, at rest.
         u: Input ``(n_u,)``.
-        speed: Size of the motion ``(n_x / 2,)`` [units of v], positive.
+        speed: Amplitude of the speeds ``(n_x / 2,)`` [units of v], positive.
         h: Hidden state ``(n_h,)``, held while the speed varies. Default: its equilibrium.
-        kind: See above. Default: ``"harmonic"``.
+        kind: ``"secant"`` or ``"harmonic"``. Default: ``"harmonic"``.
 
     Returns:
         ``control.StateSpace`` as from :func:`linearize`.
 
     Raises:
-        InputError: If a size is wrong, a speed is not positive, or the hidden state finds no rest.
+        InputError: If a size is wrong, a speed is not positive, or the hidden state has no equilibrium.
+
+    Source: Gelb and Vander Velde, *Multiple-Input Describing Functions and Nonlinear System Design*, 1968, section 2.2.
     """
     n_q, n_z = positions_of(model), model.n_x + model.n_h
     size = _positive(speed, n_q)
@@ -197,17 +201,17 @@ def linearize_secant(
 
 @dataclass(frozen=True)
 class FrictionSlopes:
-    """Damping ``-d(acceleration) / d(speed)`` [1/s] of one axis at rest, for motions of sizes ``speed``.
+    """Damping ``-d(acceleration) / d(speed)`` [1/s] of one axis, for motions of the amplitudes ``speed``.
 
-    Times the inertia it is a viscous damping coefficient.
+    The damping times the inertia is a viscous damping coefficient.
 
     Args:
         speed: Speeds ``(n,)`` [unit of v].
-        tangent: Slope at rest, the same for all speeds: what :func:`linearize` takes.
-        secant: ``(n,)``: slope of the line through the accelerations at ``+speed`` and ``-speed``.
-        harmonic: ``(n,)``: describing function of a sinusoid of that amplitude.
-        moving: ``(n,)``: slope at the speed itself, as :func:`linearize_at_speed` takes it.
-        per_input: Acceleration per unit of the input [unit of a / input unit], to turn slopes into input units.
+        tangent: Damping from the slope at rest, as in :func:`linearize`; the same for all speeds.
+        secant: ``(n,)``: from the line through the accelerations at ``+speed`` and ``-speed``.
+        harmonic: ``(n,)``: from the describing function of a sinusoid of that amplitude.
+        moving: ``(n,)``: from the slope at the speed itself, as in :func:`linearize_at_speed`.
+        per_input: Acceleration per unit of the input [unit of a / input unit]; converts damping to input units.
     """
 
     speed: Array
@@ -221,17 +225,17 @@ class FrictionSlopes:
 def friction_slopes(
     model: HybridModel, q: ArrayLike, speeds: ArrayLike, u: ArrayLike | None = None, *, axis: int = 0
 ) -> FrictionSlopes:
-    """Damping of one axis as tangent, secant, describing function and tangent in motion.
+    """Compute the damping of one axis as tangent, secant, describing function and tangent in motion.
 
     Args:
         model: The model, state ``[q, v]``.
         q: Positions ``(n_x / 2,)``.
-        speeds: Sizes of the speed ``(n,)``, positive.
+        speeds: Amplitudes of the speed ``(n,)``, positive.
         u: Input ``(n_u,)``. Default: zero.
         axis: Number of the axis. Default: the first.
 
     Raises:
-        InputError: If a size is wrong, a speed is not positive, or the hidden state finds no rest.
+        InputError: If a size is wrong, a speed is not positive, or the hidden state has no equilibrium.
 
     Source: the describing function: Gelb and Vander Velde, *Multiple-Input Describing Functions and Nonlinear System
     Design*, 1968, section 2.2.
@@ -266,21 +270,23 @@ def _positive(speed: ArrayLike, n: int) -> Array:
 
 
 def _shares(kind: Kind) -> Array:
-    """Shares of the largest speed at which a motion is looked at, of half a period; the other mirrors it."""
+    """Evaluation points of a motion over its amplitude, for half a period; the other half is its mirror image."""
     if kind == "secant":
         return np.ones(1)
     return np.asarray(np.cos((np.arange(ANGLES // 2) + 0.5) * (2 * np.pi / ANGLES)))
 
 
 def _chord(f: Any, v: float, kind: Kind) -> Any:
+    """Slope of ``f`` over the amplitude ``v``: secant, or gain of the first harmonic."""
     if kind == "secant":
         return (f(v) - f(-v)) / (2 * v)
+    # describing function N(v) = mean(f(p) p) / mean(p^2) over p = v cos(phase), by the midpoint rule
     points = v * _shares(kind)
     return sum(f(p) * p for p in points) / float(np.sum(points**2))
 
 
 def _slope_of(model: HybridModel, i: int) -> Any:
-    """``(x, h, u)`` to the derivatives of ``xdot[i]`` by ``x[i]`` and by the first input."""
+    """Function of ``(x, h, u)``: derivatives of ``xdot[i]`` with respect to ``x[i]`` and to the first input."""
     x, h, u = ca.MX.sym("x", model.n_x), ca.MX.sym("h", model.n_h), ca.MX.sym("u", model.n_u)
     rate = model.xdot(x, h, u, model.w, model.p)[i]
     f = ca.Function("slope", [x, h, u], [ca.jacobian(rate, x)[i], ca.jacobian(rate, u)[0]])
@@ -289,9 +295,10 @@ def _slope_of(model: HybridModel, i: int) -> Any:
 
 @dataclass(frozen=True)
 class AlongTrajectory:
-    """``dz_{k+1} = A_k dz_k + B_k du_k``, ``dy_k = C_k dz_k + D_k du_k`` around a trajectory, ``z = (x, h)``.
+    """Linear time-varying system around a trajectory of n periods, with ``z = (x, h)``.
 
-    States ``x``, hidden states ``h``, inputs ``u`` and the matrices have a row for each of the n periods.
+    ``dz_{k+1} = A_k dz_k + B_k du_k``, ``dy_k = C_k dz_k + D_k du_k``. States ``x``, hidden states ``h``, inputs ``u``
+    and the matrices have one row for each period.
     """
 
     model: HybridModel
@@ -304,20 +311,20 @@ class AlongTrajectory:
     D: Array
 
     def system(self, k: int) -> Any:
-        """The frozen system of period ``k`` as ``control.StateSpace``."""
+        """Return the frozen system of period ``k`` as ``control.StateSpace``."""
         return _state_space(self.model, self.A[k], self.B[k], self.C[k], self.D[k])
 
     def mean(self, skip: int = 0) -> Any:
-        """The matrices' means over the trajectory as ``control.StateSpace``: statistical linearization.
+        """Return the mean matrices over the trajectory as ``control.StateSpace`` (statistical linearization).
 
-        For a Gaussian deviation the mean slope is the linear map that predicts a function best: what motions like this
-        one see of friction and of all else that is nonlinear, networks included.
+        For Gaussian deviations, the mean Jacobian is the linear map with the least mean squared error. So the result
+        describes friction, networks and all other nonlinear effects as they act on motions like this trajectory.
 
         Args:
-            skip: Periods left out at the start.
+            skip: Number of periods to leave out at the start. Default: none.
 
         Raises:
-            InputError: If nothing is left.
+            InputError: If no period remains.
 
         Source: Roberts and Spanos, *Random Vibration and Statistical Linearization*, 1990, section 5.3.
         """
@@ -342,17 +349,17 @@ class AlongTrajectory:
 def linearize_along(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None
 ) -> AlongTrajectory:
-    """Exact linearizations at every period of a trajectory.
+    """Linearize a model exactly at every period of a trajectory.
 
     Args:
         model: The model.
-        x: Start ``(n_x,)`` of a free run of the model, or a trajectory ``(n, n_x)`` (measured, say), along which the
-            hidden state runs.
+        x: Initial state ``(n_x,)`` of a free run of the model, or a trajectory ``(n, n_x)``, for example a measured
+            one; the hidden state follows the trajectory.
         u: Inputs ``(n, n_u)``.
-        h: Hidden state ``(n_h,)`` at the start. Default: zero, as in training.
+        h: Initial hidden state ``(n_h,)``. Default: zero, as in training.
 
     Raises:
-        InputError: If a shape does not fit, or the free run leaves the numbers.
+        InputError: If a shape does not fit, or the free run is not finite.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal

@@ -1,4 +1,4 @@
-"""Controllers and estimators to first order, the loop they close with a plant, its margins and sensitivities."""
+"""Linearized controllers and observers, their loop with a plant, and its margins and sensitivities."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 FREQUENCIES = 2000
 SETTLE = 10
-"""Solves after which a real-time iteration has settled on its plan: one linearization each, and Newton's method doubles
-the digits of each."""
+"""Solves after which a real-time iteration has converged to its plan: each solve is one Newton step, which doubles the
+number of correct digits."""
 DIFFERENCE = 1e-4
-"""Step of a difference, as a share of a signal's size: its error falls with the square of the step, that of the solves
-(1e-9) is divided by it."""
+"""Step of a central difference over a signal's size. The truncation error is proportional to the step squared; the
+error of the solves (1e-9) is divided by the step."""
 INTEGRATES = 1e-5
-"""Distance from 1 at which a pole is an integrator's: rounding (1e-16) moves three that are one by its third root."""
+"""Distance from 1 at which a pole counts as an integrator: rounding (1e-16) moves a triple pole by its third root."""
 MOST_DELAY = 200
-"""Most whole periods of delay that are tried."""
+"""Maximum number of whole periods of delay that are tried."""
 
 
 @dataclass(frozen=True)
 class MpcGain:
-    """An MPC to first order: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
+    """Linearized MPC: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
 
-    It is exact as long as no bound acts and the prediction's linearization stays the same. ``z = (x, h)`` and ``d``,
-    the unmeasured disturbances, are estimates; ``u_before`` is the input held before (its gain is zero without
-    ``r_delta``), and ``r`` a reference that is constant over the horizon.
+    Exact while no bound is active and the linearization of the prediction does not change. ``z = (x, h)`` and the
+    unmeasured disturbances ``d`` are estimates. ``u_before`` is the previous input (its gain is zero without
+    ``r_delta``). ``r`` is a reference that is constant over the horizon.
     """
 
     by_state: Array
@@ -64,21 +64,21 @@ class MpcGain:
 def mpc_gain(
     controller: CondensedController, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None, *, system: Any = None
 ) -> MpcGain:  # fmt: skip
-    """Derivative of the QP's solution where no bound acts, at an operating point that the whole plan holds.
+    """Derivative of the QP's solution without active bounds, at an operating point that the whole plan holds.
 
-    The condensed QP ``min 1/2 s'Hs + g's`` has the solution ``s = -H^{-1} g``, and ``g`` is affine in the estimate,
-    the disturbance, the input before and the reference; so the derivative is a solve with the controller's own ``H``.
+    The condensed QP ``min 1/2 s'Hs + g's`` has the solution ``s = -H^{-1} g``. ``g`` is affine in the estimate, the
+    disturbance, the previous input and the reference. So the derivative is a solve with the controller's ``H``.
 
     Args:
         controller: The real-time iteration; its weights, horizon, terminal weight and move blocks are used.
         x: Operating point ``(n_x,)``.
-        u: Input there ``(n_u,)``, within the bounds.
+        u: Input at that point ``(n_u,)``, within the bounds.
         h: Hidden state ``(n_h,)``. Default: its equilibrium.
-        system: Linearization over ``(x, h)`` that the prediction is to have, e.g. of :func:`linearize_secant`.
-            Default: the tangent at the point.
+        system: Linearization over ``(x, h)`` for the prediction, e.g. of :func:`linearize_secant`. Default: the tangent
+            at the point.
 
     Raises:
-        InputError: If a size is wrong, the point violates a bound of the inputs or a soft one, or the problem has an
+        InputError: If a size is wrong, the point violates an input bound or a soft bound, or the problem has an
             economic stage cost (its curvature changes along the plan).
 
     Source: Fiacco, *Introduction to Sensitivity and Stability Analysis in Nonlinear Programming*, 1983; Bemporad,
@@ -140,20 +140,21 @@ def solved_gain(
     controller: Controller, x: ArrayLike, u: ArrayLike, reference: ArrayLike, h: ArrayLike | None = None,
     *, w: ArrayLike | None = None,
 ) -> MpcGain:  # fmt: skip
-    """The same of any solver and problem, by central differences of its own solves around the plan that it settles on.
+    """Linearized MPC of any solver and problem, by central differences of its solves around the converged plan.
 
-    Unlike :func:`mpc_gain` it knows weights on outputs, their targets, economic costs and any disturbance model.
+    Unlike :func:`mpc_gain`, this function supports weights on outputs, their targets, economic costs and any
+    disturbance model.
 
     Args:
         controller: The solver.
         x: Operating point ``(n_x,)``.
-        u: Input there ``(n_u,)``, within the bounds.
-        reference: What is asked for, a row ``(columns,)``, held over the horizon.
+        u: Input at that point ``(n_u,)``, within the bounds.
+        reference: Reference, one row ``(columns,)``, constant over the horizon.
         h: Hidden state ``(n_h,)``. Default: its equilibrium.
         w: Measured disturbances ``(n_w,)``. Default: the operating point's.
 
     Raises:
-        InputError: If a size is wrong, the input that the plan holds lies on a bound, or a solve fails.
+        InputError: If a size is wrong, the plan's input lies on a bound, or a solve fails.
 
     Example:
         >>> import casadi as ca
@@ -226,16 +227,16 @@ def gain_schedule(
     model: HybridModel, points: Iterable[tuple[ArrayLike, ArrayLike]], q: ArrayLike, r: ArrayLike,
     *, speed: ArrayLike | None = None, kind: Kind = "harmonic",
 ) -> GainSchedule:  # fmt: skip
-    """LQR of the linearization at each point, hidden states (at their equilibrium) without weight.
+    """Compute LQR gains of the linearization at each point; hidden states are at their equilibrium and have no weight.
 
     Args:
         model: The model.
         points: Operating points ``(x, u)``.
         q: Weights of the states ``(n_x,)``.
         r: Weights of the inputs ``(n_u,)``, positive.
-        speed: Size of the motion that the friction is linearized for, see :func:`linearize_secant`. Default: the
-            tangent at the point.
-        kind: How, see there.
+        speed: Amplitude of the motion for which friction is linearized (:func:`linearize_secant`). Default: the tangent
+            at the point.
+        kind: Kind of that linearization. Default: ``"harmonic"``.
 
     Raises:
         InputError: If there is no point, a size is wrong, or a linearization is not stabilisable.
@@ -268,7 +269,7 @@ def gain_schedule(
 
 @dataclass(frozen=True)
 class SteadyFilter:
-    """A Kalman filter in its steady state over ``w = (x, h, d)``: ``w- = F w + G u``, ``w = w- + gain (y - C w-)``.
+    """Steady-state Kalman filter over ``w = (x, h, d)``: ``w- = F w + G u``, ``w = w- + gain (y - C w-)``.
 
     ``P`` is the covariance after a measurement.
     """
@@ -283,17 +284,19 @@ class SteadyFilter:
 def steady_filter(
     ekf: ExtendedKalmanFilter, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None, *, system: Any = None
 ) -> SteadyFilter:  # fmt: skip
-    """The extended filter's gain once its covariance has settled at an operating point.
+    """Compute the steady-state gain of the extended Kalman filter at an operating point.
+
+    The covariance P- before a measurement solves ``P- = F (P- - P- C' (C P- C' + R)^-1 C P-) F' + Q``.
 
     Args:
-        ekf: The filter; a disturbance that it takes for constant keeps a gain of zero.
+        ekf: The filter; a disturbance without process noise has a gain of zero.
         x: Operating point ``(n_x,)``.
-        u: Input there ``(n_u,)``.
+        u: Input at that point ``(n_u,)``.
         h: Hidden state ``(n_h,)``. Default: its equilibrium.
         system: Linearization over ``(x, h)`` instead of the tangent at the point. Default: none.
 
     Raises:
-        InputError: If a size is wrong, an output depends on the input at once, or the covariance does not settle.
+        InputError: If a size is wrong, an output depends directly on the input, or the covariance does not converge.
 
     Source: Anderson and Moore, *Optimal Filtering*, 1979, section 4.4.
 
@@ -320,7 +323,9 @@ def steady_filter(
     known = Estimate(
         0.0, x0, h0, np.zeros(n_d), np.zeros((n_w, n_w)), np.full(model.n_y, np.nan), float("nan")
     )
-    noise = np.diag(ekf.predict(known, u0).P)  # of a state that was known exactly: what one period adds
+    noise = np.diag(
+        ekf.predict(known, u0).P
+    )  # Q: the variance that one period adds to an exactly known state
     noise_y = ekf.innovation_covariance(known, u0)
     f, g = np.eye(n_w), np.zeros((n_w, n_u))
     f[:n_z, :n_z], f[:n_z, n_z:], g[:n_z] = sys.A, np.asarray(sys.B) @ on_u, sys.B
@@ -344,21 +349,20 @@ def steady_filter(
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a loop is from instability, broken at one input.
+    """Stability margins of a loop, broken at one input.
 
     Args:
-        gain_up: Factor on the loop's gain that makes it unstable, above 1; infinite if none does.
-        gain_down: Such a factor below 1; 0 if none does.
+        gain_up: Smallest factor above 1 on the loop's gain that makes the loop unstable; infinite if there is none.
+        gain_down: Largest such factor below 1; 0 if there is none.
         phase: Smallest phase margin [rad]; infinite without gain crossover.
-        delay: Smallest delay margin [s]: phase margin over its crossover frequency, all crossovers looked at.
-        delay_periods: Most whole periods of delay at the input with which the closed loop's poles are still inside the
-            circle; 0 where one already is too many.
-        crossover: Highest gain crossover [rad/s]; NaN without.
+        delay: Smallest delay margin [s]: smallest ratio of phase margin to frequency over all gain crossovers.
+        delay_periods: Largest number of whole periods of delay at the input for which the closed loop is stable.
+        crossover: Highest gain crossover [rad/s]; NaN without gain crossover.
         modulus: Smallest distance of the Nyquist curve from -1: one over the peak of the sensitivity.
-        disk: Symmetric disk margin [-]: gain may vary by ``(1 + disk / 2) / (1 - disk / 2)`` either way, or phase by
-            ``disk_phase``, or some of both, at any frequency.
-        disk_gain: That factor.
-        disk_phase: That phase [rad].
+        disk: Symmetric disk margin [-]. At any frequency, the gain may vary by the factor ``disk_gain`` up or down, or
+            the phase by ``disk_phase``, or both by less.
+        disk_gain: ``(1 + disk / 2) / (1 - disk / 2)``.
+        disk_phase: ``2 atan(disk / 2)`` [rad].
     """
 
     gain_up: float
@@ -377,8 +381,8 @@ class Margins:
 class LinearLoop:
     """A linearized loop of plant and output feedback, both discrete ``control.StateSpace``, with ``u = feedback y``.
 
-    ``closed`` leads from loads at the inputs and noise at the outputs to outputs and inputs; ``poles`` are its, largest
-    first.
+    ``closed`` is the closed loop from loads at the inputs and noise at the outputs to outputs and inputs. ``poles`` are
+    the poles of ``closed``, largest first.
     """
 
     plant: Any
@@ -392,7 +396,7 @@ class LinearLoop:
         return bool(np.abs(self.poles[0]) < 1.0)
 
     def broken(self, input: int = 0) -> Any:
-        """The loop transfer function with one input cut open, the others closed, in negative-feedback sign."""
+        """Return the loop transfer function, broken at one input with the others closed, for negative feedback."""
         n_u = self.plant.ninputs
         if not 0 <= input < n_u:
             raise InputError(
@@ -412,9 +416,10 @@ class LinearLoop:
         )
 
     def margins(self, input: int = 0) -> Margins:
-        """Margins of the loop broken at one input, by python-control on a fine grid of frequencies.
+        """Compute the margins of the loop broken at one input, by python-control on a fine grid of frequencies.
 
-        A closed loop that is not stable has none: an InputError.
+        Raises:
+            InputError: If the closed loop is unstable; then it has no margins.
         """
         if not self.stable:
             raise InputError(
@@ -429,11 +434,11 @@ class LinearLoop:
         gains, phases = np.atleast_1d(gains), np.radians(np.atleast_1d(phases))
         g = response.magnitude[0, 0] * np.exp(1j * response.phase[0, 0])
         at_nyquist = float(g[-1].real)
-        ends = [at_nyquist, _at_rest(broken)]  # real: crossings that python-control leaves out
+        ends = [at_nyquist, _steady_gain(broken)]  # crossings of the real axis that python-control leaves out
         gains = np.append(gains, [-1.0 / end for end in ends if end < 0])
         at = np.atleast_1d(at_phase)
         delays = [(p % (2 * np.pi)) / w for p, w in zip(phases, at, strict=True)]
-        if at_nyquist > 1:  # one period turns it to below -1, and no gain crossover tells
+        if at_nyquist > 1:  # one period of delay turns it to below -1, without a gain crossover
             delays.append(dt)
         disk, _, _ = control.disk_margins(broken, omega, skew=0.0)
         size = min(float(disk), 2.0)
@@ -451,12 +456,13 @@ class LinearLoop:
         )
 
     def _delay_periods(self, input: int) -> int:
+        """Largest number of periods of delay at an input for which the loop is stable, at most ``MOST_DELAY``."""
         loop = self.broken(input)
         a, b, c, d = matrices(loop)
         for periods in range(1, MOST_DELAY + 1):
             n = len(a)
             whole = np.zeros((n + periods, n + periods))
-            # the newest value of the line is -(C x + D oldest), the oldest one acts
+            # delay line: the newest element is -(C x + D oldest), and the oldest element is the input
             whole[:n, :n], whole[:n, n:][:, -1:] = a, b
             whole[n : n + 1, :n], whole[n, -1] = -c, -d.item()
             whole[n + 1 :, n:-1] += np.eye(periods - 1)
@@ -465,12 +471,14 @@ class LinearLoop:
         return MOST_DELAY
 
     def sensitivity(self, omega: ArrayLike) -> Mapping[str, Complex]:
-        """Sensitivity functions at frequencies ``(n,)`` [rad/s] in ``(0, pi / dt]``.
+        """Compute sensitivity functions at frequencies ``(n,)`` [rad/s] in ``(0, pi / dt]``.
+
+        With ``u = K y``: ``S = (I - K G)^-1``, ``T = I - S = -S K G``, ``S_y = (I - G K)^-1``.
 
         Returns:
-            ``"S"`` and ``"T"`` ``(n_u, n_u, n)`` at the inputs: what is left of a load there, and what of it the
-            controller's input takes; ``"KS"`` ``(n_u, n_y, n)`` from noise of the outputs to the inputs; ``"GS"``
-            ``(n_y, n_u, n)`` from loads to the outputs; ``"S_y"`` ``(n_y, n_y, n)`` at the outputs.
+            ``"S"`` and ``"T"`` ``(n_u, n_u, n)`` at the inputs: the remaining part of a load, and the part that the
+            controller compensates; ``"KS"`` ``(n_u, n_y, n)`` from output noise to inputs; ``"GS"`` ``(n_y, n_u, n)``
+            from loads to outputs; ``"S_y"`` ``(n_y, n_y, n)`` at the outputs.
 
         Raises:
             InputError: If a frequency lies outside.
@@ -484,20 +492,20 @@ class LinearLoop:
 
 
 def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0) -> LinearLoop:
-    """The loop of an MPC's gain, a steady filter and a plant, in the order of ``simulate``.
+    """Close the loop of an MPC's gain, a steady-state filter and a plant, in the order of ``simulate``.
 
     At ``t_k``: measure ``y_k``, ``w_k = w- + L (y_k - C w-)`` with ``w- = F w_{k-1} + G u_{k-1}``, then ``u_k`` from
     ``w_k`` and ``u_{k-1}``, held until ``t_{k+1}``.
 
     Args:
-        gain: Of the controller, see :func:`mpc_gain`.
-        filter: Of the estimator, see :func:`steady_filter`.
-        plant: Discrete ``control.StateSpace`` of the machine: the model itself, or a better one, to see what a
-            controller on a prior is worth on the hybrid.
-        delay: Whole periods that the input arrives late, unknown to the controller. Default: none.
+        gain: Gain of the controller (:func:`mpc_gain`).
+        filter: Gain of the observer (:func:`steady_filter`).
+        plant: Discrete ``control.StateSpace`` of the machine: the controller's model, or another one, for example the
+            hybrid as plant of a controller on the prior.
+        delay: Delay of the input in whole periods, unknown to the controller. Default: none.
 
     Raises:
-        InputError: If sizes or periods do not fit, or the plant's outputs depend on its inputs at once.
+        InputError: If sizes or periods do not fit, or the plant's outputs depend directly on its inputs.
 
     Example:
         >>> import control
@@ -527,7 +535,7 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
         raise InputError(
             f"loop: delay must be a whole number of periods, at least 0, got {delay} [HM-ANALYZE-032]"
         )
-    # a disturbance that the filter takes for constant stays zero: it is no state of the loop
+    # a disturbance with a gain of zero stays zero, so it is not a state of the loop
     alive = (np.arange(n_w) < n_z) | np.any(filter.gain != 0, axis=1)
     k, follow = np.hstack([gain.by_state, gain.by_load])[:, alive], filter.gain[alive]
     keep = np.eye(int(alive.sum())) - follow @ filter.C[:, alive]
@@ -538,13 +546,13 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
     feedback = control_toolbox().ss(a, b, out, k @ follow, plant.dt, remove_useless_states=False)
     late = plant
     for _ in range(delay):
-        late = _delayed(late)
+        late = _delay_inputs(late)
     closed = _closed(late, feedback)
     return LinearLoop(late, feedback, closed, poles_of(closed.A))
 
 
-def _delayed(plant: Any) -> Any:
-    """The plant with its inputs one period late."""
+def _delay_inputs(plant: Any) -> Any:
+    """Delay the plant's inputs by one period."""
     a, b, c, _ = matrices(plant)
     n, n_u = b.shape
     whole = np.block([[a, b], [np.zeros((n_u, n + n_u))]])
@@ -554,7 +562,7 @@ def _delayed(plant: Any) -> Any:
 
 
 def _open(plant: Any, feedback: Any) -> tuple[Array, Array, Array, Array]:
-    """From the plant's inputs through plant and feedback."""
+    """State space of the series of plant and feedback, from the plant's inputs to the controller's inputs."""
     a, b, c, _ = matrices(plant)
     f, g, h, k = matrices(feedback)
     whole = np.block([[a, np.zeros((len(a), len(f)))], [g @ c, f]])
@@ -563,7 +571,7 @@ def _open(plant: Any, feedback: Any) -> tuple[Array, Array, Array, Array]:
 
 
 def _closed(plant: Any, feedback: Any) -> Any:
-    """From loads at the inputs and noise at the outputs to outputs and the controller's inputs."""
+    """Closed loop from loads at the inputs and noise at the outputs to outputs and the controller's inputs."""
     a, b, c, _ = _open(plant, feedback)
     n, (n_y, n_u) = plant.nstates, (plant.noutputs, plant.ninputs)
     _, g, _, k = matrices(feedback)
@@ -582,8 +590,8 @@ def _response(sys: Any, omega: ArrayLike) -> Complex:
     return np.asarray(np.moveaxis(response.magnitude * np.exp(1j * response.phase), -1, 0))
 
 
-def _at_rest(sys: Any) -> float:
-    """Gain of a single loop at the frequency zero; 0 with an integrator, whose curve goes to infinity there."""
+def _steady_gain(sys: Any) -> float:
+    """Gain of a single loop at frequency zero; 0 for a loop with an integrator, whose gain is infinite there."""
     a, b, c, d = matrices(sys)
     if not len(a):
         return float(d.item())
@@ -593,7 +601,7 @@ def _at_rest(sys: Any) -> float:
 
 
 def _grid(sys: Any, dt: float) -> Array:
-    """Frequencies up to Nyquist, with all slow poles and the circle's top covered."""
+    """Frequencies up to the Nyquist frequency, denser near the poles."""
     poles = np.linalg.eigvals(sys.A).astype(np.complex128)
     sizes = np.abs(np.log(poles[np.abs(poles) > 0])) / dt
     moving = sizes[(sizes > 1e-6) & (sizes < np.pi / dt)]

@@ -1,4 +1,4 @@
-"""Frequency responses estimated from signals: from recordings, or from a machine driven by a multisine."""
+"""Frequency responses estimated from recordings, or from a machine driven by a multisine."""
 
 from __future__ import annotations
 
@@ -18,21 +18,26 @@ from hybrid_mpc.model.model import HybridModel
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Run: TypeAlias = Callable[[Array], Array]
-"""Inputs ``(n,)`` to outputs ``(n,)`` of one channel, measured before each input acts."""
+"""Function from inputs ``(n,)`` to outputs ``(n,)`` of one channel; each output is measured before its input acts."""
 LARGEST = 1e60
-"""Sample beyond which a run has diverged: products of its powers would leave the range of numbers."""
+"""Size of a sample above which a run has diverged: products of its powers would overflow."""
 BY_CHANCE = 0.01
-"""Share of the lines of unrelated signals that would pass for a response."""
+"""Significance level: share of the frequencies of unrelated signals whose coherence passes the test."""
 
 
 @dataclass(frozen=True)
 class MeasuredResponse:
     """A frequency response ``(n,)`` from one input to one output, estimated from signals.
 
-    Of a nonlinear machine it is the best linear approximation for signals of that size and band: it depends on both.
-    Compare it with the same estimate from a model that was given the same inputs. ``coherence`` is the share of the
-    output's power that is linear in the input; 1 is clean. ``deviation`` is the standard deviation of ``|response|``:
-    noise, and nonlinearity that looks like noise. ``averages`` counts independent ones behind each value.
+    For a nonlinear machine, the response is the best linear approximation, which depends on amplitude and band of the
+    signals. Compare it with the same estimate of a model with the same inputs.
+
+    Args:
+        omega: Frequencies ``(n,)`` [rad/s].
+        response: Complex response ``(n,)``.
+        coherence: Share of the output's power that is linear in the input ``(n,)``; 1 without noise.
+        deviation: Standard deviation of ``|response|`` ``(n,)``, from noise and nonlinear effects.
+        averages: Number of independent averages of each value.
     """
 
     omega: Array
@@ -43,10 +48,10 @@ class MeasuredResponse:
 
     @property
     def trusted(self) -> NDArray[np.bool_]:
-        """Where the output is surely driven by the input ``(n,)``.
+        """Mask ``(n,)`` of the frequencies with significant coherence.
 
-        Of ``averages`` pieces of signals that have nothing to do with each other one line in a hundred has a coherence
-        above ``1 - 0.01^(1 / (averages - 1))``: 0.99 of 2 pieces, 0.78 of 4, 0.22 of 20. What lies below says nothing.
+        The coherence of unrelated signals exceeds ``1 - 0.01^(1 / (averages - 1))`` at one frequency in a hundred: 0.99
+        for 2 averages, 0.78 for 4, 0.22 for 20. A smaller coherence is not significant.
 
         Source: Carter, Knapp and Nuttall, *Estimation of the magnitude-squared coherence function via overlapped fast
         Fourier transform processing*, IEEE Trans. Audio Electroacoust. 21 (1973).
@@ -60,12 +65,12 @@ def welch_response(
 ) -> MeasuredResponse:
     """H1 estimate ``S_uy / S_uu`` with its coherence, averaged over half-overlapping Hann windows of all pieces.
 
-    Pieces are pairs of inputs and outputs ``(n,)``; those shorter than a window of ``length`` [s] are left out. H1 is
-    unbiased by noise of the output. A window that is short against the machine's ringing smears its resonance.
+    Pieces are pairs of inputs and outputs ``(n,)``; pieces shorter than a window of ``length`` [s] are left out. Noise
+    of the output does not bias H1. A window that is shorter than the decay of a resonance smears this resonance.
 
     Raises:
-        InputError: If no piece is long enough, shapes differ, a signal diverges, or fewer than four windows come
-            together: coherence of one window is 1 whatever the signals are.
+        InputError: If no piece is long enough, shapes differ, a signal diverges, or there are fewer than four windows
+            (the coherence of a single window is always 1).
 
     Source: Welch, *The use of fast Fourier transform for the estimation of power spectra*, IEEE Trans. Audio
     Electroacoust. 15 (1967), also for the variance of overlapping windows; Bendat and Piersol, *Random Data*, 4th
@@ -103,22 +108,23 @@ def multisine_response(
     run: Run, dt: float, *, amplitude: float, band: tuple[float, float], period: float = 10.0, periods: int = 4,
     settle: int = 1, bias: float = 0.0, odd: bool = True,
 ) -> MeasuredResponse:  # fmt: skip
-    """Response at the lines of a multisine that a machine or a model is driven by, without leakage.
+    """Estimate the response of a machine or model at the frequencies of a multisine, without leakage.
 
     Args:
         run: The machine: a plant (:func:`run_plant`) or a model (:func:`run_model`).
-        dt: Period of the input [s].
+        dt: Sampling period of the input [s].
         amplitude: Largest deviation of the input from its bias [input unit].
-        band: Lowest and highest line [Hz].
+        band: Lowest and highest frequency [Hz].
         period: Period of the multisine [s].
-        periods: Whole periods that count; from their scatter comes the deviation.
-        settle: Whole periods that are left out at the start.
+        periods: Number of evaluated periods; their scatter gives the deviation.
+        settle: Number of periods that are left out at the start.
         bias: Mean input. Default: zero.
-        odd: Odd lines only, so that what an even nonlinearity makes falls between them. Default: yes.
+        odd: True: only odd multiples of the base frequency; effects of even nonlinearities then fall between them.
+            Default: True.
 
     Raises:
-        InputError: If fewer than two periods count, the period is no multiple of ``dt``, the band holds no line, or the
-            run diverges.
+        InputError: If fewer than two periods are evaluated, the period is not a multiple of ``dt``, the band holds no
+            frequency of the multisine, or the run diverges.
 
     Source: Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, 2nd edition, chapter 4.
 
@@ -148,14 +154,14 @@ def multisine_response(
 
 
 def run_plant(plant: Plant, x0: ArrayLike, dt: float, *, seed: int = 0, output: int = 0) -> Run:
-    """A simulated machine as a :data:`Run`, its sensor noise included.
+    """Wrap a simulated machine as a :data:`Run`, with its sensor noise.
 
     Args:
         plant: The machine.
-        x0: Start ``(n_x,)``.
+        x0: Initial state ``(n_x,)``.
         dt: Period over which each input is held [s].
-        seed: Of the plant and the noise.
-        output: Which output. Default: the first.
+        seed: Seed of the plant and of the noise. Default: 0.
+        output: Number of the output. Default: the first.
 
     Example:
         ``multisine_response(run_plant(scenario.plant(), [0.0, 0.0], 0.02), 0.02, amplitude=0.2, band=(0.1, 3.0))``
@@ -173,13 +179,13 @@ def run_plant(plant: Plant, x0: ArrayLike, dt: float, *, seed: int = 0, output: 
 
 
 def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *, output: int = 0) -> Run:
-    """A model's free run as a :data:`Run`.
+    """Wrap a model's free run as a :data:`Run`.
 
     Args:
-        model: The model; it has one input.
-        x0: Start ``(n_x,)``.
-        h0: Hidden state there ``(n_h,)``. Default: zero.
-        output: Which output. Default: the first.
+        model: The model, with one input.
+        x0: Initial state ``(n_x,)``.
+        h0: Initial hidden state ``(n_h,)``. Default: zero.
+        output: Number of the output. Default: the first.
 
     Raises:
         InputError: If the model has several inputs.
@@ -205,7 +211,7 @@ def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *,
 
 
 def _check_power(signal: Array, what: str) -> None:
-    """Refuse a signal ``(n,)`` whose power is no number."""
+    """Refuse a signal ``(n,)`` whose power is not finite."""
     wrong = np.flatnonzero(~(np.abs(signal) <= LARGEST))
     if wrong.size:
         raise InputError(
@@ -215,6 +221,11 @@ def _check_power(signal: Array, what: str) -> None:
 
 
 def _response(omega: Array, uu: Array, yy: Array, uy: Complex, averages: float) -> MeasuredResponse:
+    """Response, coherence and standard deviation from (cross) power spectra.
+
+    ``G = S_uy / S_uu``, ``c = |S_uy|^2 / (S_uu S_yy)``, ``std(|G|) = |G| sqrt((1 - c) / (2 averages c))`` (Bendat and
+    Piersol, section 9.2).
+    """
     floor = 1e-12 * float(uu.max(initial=0.0))
     used = uu > floor
     g, coherence = np.full(omega.size, np.nan + 0j), np.zeros(omega.size)

@@ -1,4 +1,4 @@
-"""Does a recurrent model forget? A certificate over a box of inputs, and the Lyapunov exponent of a run."""
+"""Memory of a recurrent model: a contraction certificate over a box of inputs, and the Lyapunov exponent of a run."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ Array = NDArray[np.float64]
 Interval = tuple[float, float]
 CELL = "aten.gru_cell.default"
 REFINEMENTS = 50
-"""Times the box of hidden states is narrowed; it settles long before."""
+"""Iterations that narrow the box of hidden states; the box converges much earlier."""
 SETTLE = 0.2
-"""Share of the run in which the tangent vector turns into its direction; it does not count."""
+"""Share of the run at its start in which the tangent vector aligns; it is not evaluated."""
 BLOCKS = 10
+"""Stretches of the run; their scatter gives the standard deviation of the exponent."""
 
 
 def interval_bounds(f: ca.Function, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
     """Lower and upper bounds ``(m,)`` of a function's first output over a box of its first input ``(n,)``.
 
-    Never too small but for rounding (about 1e-15 of the values), mostly too large: a variable that appears twice counts
-    as two. An operation that is not known here is an InputError.
+    The bounds hold up to rounding (about 1e-15 of the values), but they are often wide: a variable that appears twice
+    is treated as two variables. An unsupported operation is an InputError.
 
     Source: Moore, Kearfott, Cloud, *Introduction to Interval Analysis*, 2009, chapter 2 and section 5.
     """
@@ -131,8 +132,14 @@ _RULES: Mapping[int, Callable[..., Interval]] = MappingProxyType(
 class GruWeights:
     """Weights of a GRU cell in torch's form, gates in the order reset, update, new.
 
-    ``r = sig(W_r s + b_ir + R_r h + b_hr)``, ``z`` likewise, ``n = tanh(W_n s + b_in + r (R_n h + b_hn))``,
-    ``h+ = (1 - z) n + z h``. By the inputs ``w`` ``(3 n_h, n_s)``, by the hidden state ``r`` ``(3 n_h, n_h)``.
+    ``r = sig(W_r s + b_ir + R_r h + b_hr)``, ``z = sig(W_z s + b_iz + R_z h + b_hz)``,
+    ``n = tanh(W_n s + b_in + r (R_n h + b_hn))``, ``h+ = (1 - z) n + z h``.
+
+    Args:
+        w: Input weights ``(3 n_h, n_s)``.
+        r: Recurrent weights ``(3 n_h, n_h)``.
+        b_w: Input biases ``(3 n_h,)``.
+        b_r: Recurrent biases ``(3 n_h,)``.
     """
 
     w: Array
@@ -152,17 +159,17 @@ class GruWeights:
 
 @dataclass(frozen=True)
 class Contraction:
-    """What the condition says of a GRU whose inputs stay in a box.
+    """Result of the contraction condition for a GRU whose inputs stay in a box.
 
     Args:
-        certified: Any two hidden states driven by the same inputs come together, at least by ``rate`` a period in a
-            weighted largest-element norm.
-        index: Spectral radius of the bound matrix; certified where it is below 1.
-        margin: ``1 - index``: positive is certified. All recurrent weights may be ``1 / index`` times as large before
-            the condition fails, roughly (the box of gates moves with them).
-        rate: Factor a period; at least 1 where nothing is certified.
-        weights: Of the norm ``max_i |dh_i| / weights_i`` ``(n_h,)``.
-        reach: Largest ``|h_i|`` that can occur ``(n_h,)``, from zero on.
+        certified: Whether the difference of any two hidden states with the same inputs decays, by at least the factor
+            ``rate`` in each period, in a weighted maximum norm.
+        index: Spectral radius of the bound matrix; certified if below 1.
+        margin: ``1 - index``; certified if positive. Roughly, all recurrent weights could be ``1 / index`` times larger
+            (the box of the gates depends on these weights too).
+        rate: Contraction factor of one period; at least 1 if not certified.
+        weights: Weights of the norm ``max_i |dh_i| / weights_i`` ``(n_h,)``.
+        reach: Largest possible ``|h_i|`` ``(n_h,)`` after a start at zero.
     """
 
     certified: bool
@@ -174,10 +181,10 @@ class Contraction:
 
 
 def gru_weights(program: Program) -> GruWeights:
-    """The weights of the only GRU cell in an exported program (``"hybrid/step"`` of an artifact).
+    """Read the weights of the only GRU cell in an exported program (``"hybrid/step"`` of an artifact).
 
     Raises:
-        InputError: If the program has none, or several.
+        InputError: If the program has no GRU cell, or several.
 
     Example:
         ``gru_weights(nn_export.load_programs(folder / "models")["hybrid/step"])``
@@ -202,12 +209,13 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
     """Bounds of the inputs of a program's GRU cell over a box of states and inputs, by interval arithmetic.
 
     Args:
-        program: ``(x, h, u, ...) -> ...`` with one GRU cell whose inputs depend on ``x`` and ``u`` alone.
+        program: ``(x, h, u, ...) -> ...`` with one GRU cell whose inputs depend only on ``x`` and ``u``.
         x: Lower and upper bounds ``(n_x, 2)``.
         u: Lower and upper bounds ``(n_u, 2)``.
 
     Raises:
-        InputError: If there is no such cell, its inputs depend on more, or an operation on the way to it is not known.
+        InputError: If there is no such cell, its inputs depend on other arguments, or an operation before the cell is
+            not supported.
     """
     cell = _cell(program)
     source = cell.args[0]
@@ -229,16 +237,17 @@ def feature_box(program: Program, x: ArrayLike, u: ArrayLike) -> tuple[Array, Ar
 
 
 def contraction(cell: GruWeights, lower: ArrayLike, upper: ArrayLike) -> Contraction:
-    """Sufficient condition for a GRU to forget its past, over a box of its inputs.
+    """Sufficient condition for a GRU to forget its initial hidden state, over a box of its inputs.
 
-    A step's Jacobian by ``h`` is ``diag(z) + diag(1 - z) E`` with ``E = diag((h - n) z) R_z + diag((1 - n^2) (R_n h +
-    b_hn) r (1 - r)) R_r + diag((1 - n^2) r) R_n``. Over the box of inputs, and the box of hidden states that they keep
-    ``h`` in, each element of ``|E|`` has a bound ``M``, from the gates' intervals. If the spectral radius of ``M`` is
-    ``index < 1``, then in the largest-element norm weighted by M's Perron vector no step stretches a difference by more
-    than ``max_i z_i + (1 - z_i) index < 1``. This is the incremental input-to-state stability of Bonassi et al., for
-    torch's cell (they reset the hidden state before the product) and in the best weighting of their norm.
+    The Jacobian of a step with respect to ``h`` is ``diag(z) + diag(1 - z) E`` with ``E = diag((h - n) z) R_z +
+    diag((1 - n^2) (R_n h + b_hn) r (1 - r)) R_r + diag((1 - n^2) r) R_n``. The intervals of the gates over the box of
+    inputs, and over the resulting box of hidden states, give an upper bound ``M`` of ``|E|``. Let ``index`` be the
+    spectral radius of ``M``. If ``index < 1``, the difference of two hidden states shrinks in each step at least by
+    ``max_i z_i + (1 - z_i) index < 1``, in the maximum norm weighted by the Perron vector of ``M``.
 
-    Most trained networks fail the condition and forget all the same; see :func:`lyapunov_exponent`.
+    This is the incremental input-to-state stability of Bonassi et al., for torch's cell (theirs resets the hidden state
+    before the product) and with the best weights of their norm. Most trained networks forget although they fail the
+    condition; see :func:`lyapunov_exponent`.
 
     Args:
         cell: The weights.
@@ -246,7 +255,7 @@ def contraction(cell: GruWeights, lower: ArrayLike, upper: ArrayLike) -> Contrac
         upper: Upper bounds ``(n_s,)``.
 
     Raises:
-        InputError: If the box has another size, is not finite or is empty.
+        InputError: If the box has the wrong size, is not finite, or is empty.
 
     Source: Bonassi, Farina, Scattolini, *On the stability properties of Gated Recurrent Units neural networks*,
     Systems & Control Letters 157 (2021) 105049.
@@ -305,7 +314,7 @@ def _sigmoid(v: Array) -> Array:
 
 
 def _perron(matrix: Array) -> tuple[float, Array]:
-    """Spectral radius of a non-negative matrix (but for a sliver), and the norm's weights in which it is its norm."""
+    """Spectral radius of a non-negative matrix (up to 1e-12), and weights whose maximum norm equals it (Perron)."""
     padded = matrix + 1e-12 * max(1.0, float(matrix.max(initial=0.0)))
     values, vectors = np.linalg.eig(padded)
     weights = np.abs(vectors[:, int(np.argmax(values.real))].real)
@@ -314,10 +323,12 @@ def _perron(matrix: Array) -> tuple[float, Array]:
 
 @dataclass(frozen=True)
 class LyapunovExponent:
-    """Mean rate [1/s] at which the distance of neighbouring runs grows along a run; negative: they come together.
+    """Largest Lyapunov exponent along a run.
 
-    ``deviation`` is the standard deviation of this mean over ten stretches of the run, ``growth`` the logarithm of the
-    distance over the first one ``(n + 1,)``, for a plot.
+    Args:
+        value: Mean growth rate of the distance of neighbouring runs [1/s]; negative: the distance decays.
+        deviation: Standard deviation of this mean, from ten stretches of the run [1/s].
+        growth: Logarithm of the distance over the initial distance ``(n + 1,)``, for a plot.
     """
 
     value: float
@@ -329,17 +340,18 @@ def lyapunov_exponent(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None,
     *, part: Literal["all", "hidden"] = "all",
 ) -> LyapunovExponent:  # fmt: skip
-    """Largest Lyapunov exponent along a free run (or along a measured trajectory), by its tangent map.
+    """Compute the largest Lyapunov exponent along a free run or a measured trajectory, by its tangent map.
 
-    With ``part="hidden"`` the states are given and only the hidden state's own map counts: negative means that along
-    this trajectory the network forgets where its hidden state began. Unlike a certificate this speaks of one run.
+    The tangent vector follows ``v_{k+1} = A_k v_k``; the exponent is the mean of ``log(|v_{k+1}| / |v_k|) / dt``. With
+    ``part="hidden"``, the states are given and only the block of the hidden state is used: a negative exponent means
+    that the network forgets its initial hidden state along this trajectory. The result holds for this run only.
 
     Args:
         model: The model.
-        x: Start ``(n_x,)`` of a free run, or a trajectory ``(n, n_x)``.
+        x: Initial state ``(n_x,)`` of a free run, or a trajectory ``(n, n_x)``.
         u: Inputs ``(n, n_u)``.
-        h: Hidden state at the start ``(n_h,)``. Default: zero.
-        part: ``"all"`` or ``"hidden"``.
+        h: Initial hidden state ``(n_h,)``. Default: zero.
+        part: ``"all"`` or ``"hidden"``. Default: ``"all"``.
 
     Raises:
         InputError: If the run is shorter than 50 periods or not finite, a shape does not fit, or there is no hidden

@@ -1,4 +1,4 @@
-"""What ``hybrid-mpc analyze`` writes: analysis.json, curves.npz, a CSV for each table, figures and a page."""
+"""Files of ``hybrid-mpc analyze``: analysis.json, curves.npz, a CSV for each table, figures and a page."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from hybrid_mpc.report.page import Cell, KeyFigure, Report, Section, Table, word
 from hybrid_mpc.watch.lengths import machine_second
 
 MODES = 6
-"""Modes of each linearization in the page's table; the CSV has all."""
+"""Number of modes of each linearization in the page's table; the CSV file has all modes."""
 Drawn = Mapping[str, tuple[Path, str]]
 
 
 def write_analysis(
     out: Path, given: AnalysisInput, result: AnalysisResult, notes: Sequence[str], command: str
 ) -> list[Path]:
-    """Write everything of an analysis into a folder; the files. ``notes`` say where the numbers came from."""
+    """Write all files of an analysis into a folder; return their paths. ``notes`` name the source of the numbers."""
     numbers, curves = flattened(result)
     region = given.x_range if given.region is None else given.region
     head = {"schema_version": 1, "notes": list(notes), "region": region, "working_speed": given.speed}
@@ -69,7 +69,7 @@ def write_analysis(
 
 
 def flattened(value: Any, path: str = "") -> tuple[Any, dict[str, Any]]:
-    """A result as numbers for JSON, and its arrays by their path; a complex number becomes ``[re, im]``.
+    """Split a result into numbers for JSON and arrays by their path; a complex number becomes ``[re, im]``.
 
     Example:
         >>> numbers, arrays = flattened({"a": {"gain": np.ones(2), "pole": 0.5 + 0.1j}})
@@ -130,7 +130,7 @@ def _equilibria(some: HybridModel, part: Mapping[str, Equilibria]) -> Table:
     return Table(
         ("model", *(s.label for s in some.states), "stability", "spectral radius [-]",
          "largest residual of a state [its unit]", "hits"),
-        rows, "Points of rest under the operating point's input in the whole range of the states.",
+        rows, "Equilibria under the operating point's input, in the whole range of the states.",
     )  # fmt: skip
 
 
@@ -145,7 +145,7 @@ def _friction(some: HybridModel, part: Mapping[str, FrictionAnalysis]) -> Table:
     return Table(
         ("model", "tangent at rest [1/s]", "secant [1/s]", "describing function [1/s]", "tangent in motion [1/s]",
          f"tangent at rest [{ratio_unit(some.inputs[0], speed)}]"), rows,
-        f"Damping of {speed.name} at rest and of motions of {working:.3g} {speed.unit} (working speed).",
+        f"Damping of {speed.name}: at rest, and for motions of {working:.3g} {speed.unit} (working speed).",
     )  # fmt: skip
 
 
@@ -159,8 +159,9 @@ def _modes(some: HybridModel, part: Mapping[str, Mapping[str, Linearization]]) -
     return Table(
         ("model", "point", "pole, real [-]", "pole, imaginary [-]", "frequency [rad/s]", "damping [-]",
          "controllability [-]", "observability [-]", "Hankel singular value [-]"), rows,
-        "Modes of the linearizations. Controllability and observability are distances from losing them; the Hankel "
-        "singular values, of inputs and outputs over their working ranges, have an order of their own.",
+        "Modes of the linearizations. Controllability and observability are relative distances from an uncontrollable "
+        "and from an unobservable mode. Hankel singular values (inputs and outputs over their working ranges) are "
+        "sorted by size; they do not belong to the mode in their row.",
     )  # fmt: skip
 
 
@@ -177,8 +178,9 @@ def _steady_gain(some: HybridModel, part: Mapping[str, Mapping[str, Linearizatio
                 rows.append((model, point, f"{y.name} by {u.name}", *here, relative))
     return Table(
         ("model", "point", "channel", "steady gain [unit beside it]", "unit", "relative gain [-]"), rows,
-        "What an output comes to under a held input. A relative gain near 1 says that this input may be paired with "
-        "this output; a negative one, that its sign turns round when the other loops are closed.",
+        "Steady-state change of an output for a unit change of an input. A relative gain near 1: this input can be "
+        "paired with this output. A negative relative gain: the sign of the gain changes when the other loops are "
+        "closed.",
     )  # fmt: skip
 
 
@@ -193,7 +195,7 @@ def _margins(some: HybridModel, part: Mapping[str, Mapping[str, Mapping[str, Loo
     return Table(
         ("loop", "point", "filter", "stable", "spectral radius [-]", "gain up [-]", "gain down [-]", "phase [rad]",
          "delay [s]", "delay [periods]", "modulus [-]", "disk [-]"), rows,
-        "Margins of the linearized loops (controller on machine), broken at the plant's input, one of them at a time.",
+        "Margins of the linearized loops (controller on machine), broken at one input of the plant at a time.",
     )  # fmt: skip
 
 
@@ -225,7 +227,8 @@ def _memory(some: HybridModel, part: Mapping[str, MemoryAnalysis]) -> Table:
     return Table(
         ("model", "largest Lyapunov exponent [1/s]", "deviation [1/s]", "hidden state alone [1/s]",
          "its deviation [1/s]", "contraction certified", "index (below 1 certifies) [-]"), rows,
-        "Whether neighbouring free runs part, and whether the network forgets where its hidden state began.",
+        "Negative exponent: neighbouring free runs converge. Negative exponent of the hidden state alone: the network "
+        "forgets its initial hidden state.",
     )  # fmt: skip
 
 
@@ -239,8 +242,8 @@ def _sensitivity(some: HybridModel, part: Mapping[str, SensitivityAnalysis]) -> 
     length = 10 * machine_second(some.dt, some.time_unit)
     return Table(
         ("model", "parameter", *heads, "identifiable"), rows,
-        f"Root mean square change of a free run of {length:.4g} s. What is not identifiable cannot be told from others "
-        "by it.",
+        f"Root mean square change of a free run of {length:.4g} s. The effect of a parameter that is not identifiable "
+        "is also an effect of the other parameters.",
     )  # fmt: skip
 
 
@@ -258,7 +261,7 @@ TITLES = {
 
 
 def figures_of(given: AnalysisInput, result: AnalysisResult) -> Named:
-    """Name, figure and caption of what was found; a missing part has no figure."""
+    """Names, figures and captions of all computed parts; a missing part has no figure."""
     parts: tuple[tuple[Any, Callable[[AnalysisInput, Any], Named]], ...] = (
         (result.friction, _draw_friction),
         (result.linear, _draw_linear),
@@ -278,7 +281,11 @@ def _draw_friction(given: AnalysisInput, part: Mapping[str, FrictionAnalysis]) -
     figure = plots.friction_damping(
         curves, working_speed=float(given.speed[0]), unit=some.states[positions_of(some)].unit
     )
-    yield "friction", figure, "Damping at rest and of motions of a size; negative slopes are left out."
+    yield (
+        "friction",
+        figure,
+        "Damping at rest, and over the amplitude of the speed; negative damping is left out.",
+    )
 
 
 def _draw_linear(given: AnalysisInput, part: Mapping[str, Mapping[str, Linearization]]) -> Named:
@@ -313,11 +320,11 @@ def _draw_linear(given: AnalysisInput, part: Mapping[str, Mapping[str, Lineariza
 
 
 CHANNEL = "_from_"
-"""Stands in a figure's name before the channel that it shows, where there are several."""
+"""Separates a figure's name from its channel, if there are several channels."""
 
 
 def _channel(some: HybridModel, i: int, j: int) -> tuple[str, str]:
-    """What a figure's name and caption say of its channel, output ``i`` and input ``j``; nothing of the only one."""
+    """Parts of a figure's name and caption that name output ``i`` and input ``j``; empty for a single channel."""
     if some.n_y * some.n_u == 1:
         return "", ""
     ends = some.inputs[j].name, some.outputs[i].name
@@ -334,8 +341,8 @@ def _draw_measured(given: AnalysisInput, part: ResponseAnalysis) -> Named:
         curves, input_signal=some.inputs[0], output_signal=some.outputs[0], source=part.source
     )
     caption = (
-        "Machine and models driven by the same inputs; band: two standard deviations. Faint lines are those whose "
-        "coherence unrelated signals reach, too (one line in a hundred is above it by chance)."
+        "Machine and models with the same inputs; band: two standard deviations. Faint parts: the coherence is not "
+        "significant (significance level 1 %)."
     )
     yield "measured", figure, caption
 
@@ -356,9 +363,7 @@ def _draw_loops(given: AnalysisInput, part: Mapping[str, Mapping[str, Mapping[st
         if shown:
             caption = f"Sensitivity functions at the plant's input{where}, linearized along a driven run."
             yield f"sensitivity{named}", plots.sensitivity_functions(shown), caption
-        caption = (
-            f"Nyquist curves of the loops broken{where or ' at the input'}, linearized along a driven run; "
-        )
+        caption = f"Nyquist curves of the loops broken{where or ' at the input'}, linearized along a driven run, for "
         curves = {label: r.open_loop for label, r in driven.items()}
         yield f"nyquist{named}", plots.nyquist(curves, modulus=0.5), f"{caption}positive frequencies."
 
@@ -388,7 +393,7 @@ def _draw_sensitivity(given: AnalysisInput, part: Mapping[str, SensitivityAnalys
 
 
 def _names(given: AnalysisInput) -> list[str]:
-    """Models in the order of drawing: priors first, so that those with a network lie above them."""
+    """Models in the order of drawing: priors first, so that models with a network lie above them."""
     return sorted(given.models, key=lambda name: given.models[name].n_h)
 
 
@@ -399,14 +404,14 @@ def _some(given: AnalysisInput) -> HybridModel:
 # The page.
 
 SECTIONS: Mapping[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
-    "equilibria": ("Points of rest", ("equilibria",), ()),
+    "equilibria": ("Equilibria", ("equilibria",), ()),
     "friction": ("Friction in a linearization", ("friction",), ("friction",)),
     "linear": (
         "Linearized models",
         ("modes", "steady_gain"),
         ("poles", "bode_rest", "bode_working", "bode_moving", "bode_driven", "steps"),
     ),
-    "measured": ("Against the machine", (), ("measured",)),
+    "measured": ("Comparison with the machine", (), ("measured",)),
     "loops": ("Control loops", ("margins",), ("sensitivity", "nyquist")),
     "schedule": ("Gain schedule", ("gain_schedule",), ("schedule",)),
     "memory": ("Memory of the recurrent part", ("memory",), ()),
@@ -430,12 +435,14 @@ def _sections(result: AnalysisResult, tables: Mapping[str, Table], drawn: Drawn)
 
 
 def _leading(modes: Table) -> Table:
-    """The first modes of each linearization."""
+    """Table of the first modes of each linearization."""
     rows: list[Sequence[Cell]] = []
     for row in modes.rows:
         if sum(r[:2] == row[:2] for r in rows) < MODES:
             rows.append(row)
-    return Table(modes.columns, rows, f"{modes.caption} The first {MODES} of each; modes.csv has all.")
+    return Table(
+        modes.columns, rows, f"{modes.caption} First {MODES} modes of each; modes.csv has all modes."
+    )
 
 
 def _about(given: AnalysisInput) -> str:
@@ -454,14 +461,16 @@ def _key_figures(result: AnalysisResult) -> list[KeyFigure]:
     keys = []
     if not isinstance(result.measured, Missing):
         for name, error in result.measured.errors.items():
-            label = f"Response to the machine's inputs, {name} against machine"
-            keys.append(KeyFigure(label, 100 * error.median, "%", "median"))
+            label = f"Error of the frequency response, {name} compared with the machine"
+            keys.append(KeyFigure(label, 100 * error.median, "%", "median over the frequencies"))
     if not isinstance(result.loops, Missing):
         for name in ("prior on prior", "hybrid on hybrid"):
             for mode, row in (result.loops[name]["driven"] if name in result.loops else {}).items():
                 if mode.startswith("quiet") and row.margins is not None:
                     where = mode.removeprefix("quiet")
                     keys.append(
-                        KeyFigure(f"Delay margin, driven, {name}{where}", 1e3 * row.margins.delay, "ms")
+                        KeyFigure(
+                            f"Delay margin along a driven run, {name}{where}", 1e3 * row.margins.delay, "ms"
+                        )
                     )
     return keys

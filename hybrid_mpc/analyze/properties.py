@@ -18,21 +18,24 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Matrices = tuple[Array, Array, Array, Array]
 RANK_TOLERANCE = 1e-8
-"""Relative distance below which a mode is not reached. Rounding of an SVD is about 1e-14; a mode this close would need
-inputs a hundred million times the others'."""
+"""Relative distance below which a mode is uncontrollable (unobservable). Rounding of an SVD is about 1e-14; a mode at
+this distance would need inputs 1e8 times larger than other modes."""
 EDGE = 1e-9
-"""Poles closer to the unit circle than this have no Gramian and are kept."""
+"""Distance of a pole from the unit circle below which the pole has no Gramian and is kept."""
 NOTHING = 1e-14
-"""Hankel singular values below this share of the largest are rounding: such states are always truncated."""
+"""Share of the largest Hankel singular value below which a value is rounding; such states are always truncated."""
 
 
 class Mode(NamedTuple):
-    """One mode of a discrete system; frequency [rad/s] and damping ratio are those of the continuous equivalent.
+    """One mode of a discrete system.
 
-    A pole at 0 has an infinite frequency, and one at 0 or 1 the damping 1. ``reach`` is the distance from being
-    uncontrollable: the smallest singular value of the Popov-Belevitch-Hautus pencil ``[A - z I, B]`` over the largest
-    of ``[A, B]``, B's columns scaled to the norm of A (units must not count); ``see`` is the dual, from being
-    unobservable.
+    Args:
+        pole: Pole z.
+        frequency: Natural frequency of the continuous equivalent ``s = log(z) / dt`` [rad/s]; infinite for z = 0.
+        damping: Damping ratio of the continuous equivalent [-]; 1 for z = 0 and z = 1.
+        reach: Controllability [-]: smallest singular value of the Popov-Belevitch-Hautus pencil ``[A - z I, B]`` over
+            the largest singular value of ``[A, B]``. Columns of B are scaled to the norm of A, so units do not matter.
+        see: Observability [-]: the same for ``(A', C')``.
     """
 
     pole: complex
@@ -43,7 +46,7 @@ class Mode(NamedTuple):
 
 
 def modes(sys: Any) -> tuple[Mode, ...]:
-    """Modes of a discrete ``control.StateSpace``, largest pole first."""
+    """Compute the modes of a discrete ``control.StateSpace``, largest pole first."""
     dt = period(sys)
     a, b, c, _ = matrices(sys)
     poles = poles_of(a)
@@ -68,7 +71,7 @@ def _hautus(a: Array, b: Array, z: complex) -> float:
 
 
 def stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
-    """Whether every mode on or outside the unit circle is reached, and whether every such mode is seen."""
+    """Whether all modes on or outside the unit circle are controllable, and whether all of them are observable."""
     risky = [m for m in found if abs(m.pole) >= 1.0 - RANK_TOLERANCE]
     return all(m.reach > RANK_TOLERANCE for m in risky), all(m.see > RANK_TOLERANCE for m in risky)
 
@@ -77,8 +80,8 @@ def stabilisable_detectable(found: tuple[Mode, ...]) -> tuple[bool, bool]:
 class Structure:
     """Modes of a discrete system, largest pole first, and its Hankel singular values ``(n,)``, largest first.
 
-    The latter are those of the stable part, inputs and outputs as they are given; infinite for each mode on or outside
-    the unit circle. ``stabilisable`` and ``detectable``: every such mode is reached, is seen.
+    Hankel singular values are those of the stable part, in the units of inputs and outputs; infinite for each mode on
+    or outside the unit circle. ``stabilisable`` and ``detectable``: all these modes are controllable, observable.
     """
 
     dt: float
@@ -89,14 +92,14 @@ class Structure:
 
 
 def system_structure(sys: Any) -> Structure:
-    """Modes of a discrete ``control.StateSpace`` with what PBH tests and Hankel singular values say of them.
+    """Compute the modes of a discrete ``control.StateSpace``, their PBH tests and the Hankel singular values.
 
-    PBH asks whether a mode can be moved (seen) at all; a Hankel singular value how much of the way from past inputs
-    to future outputs goes through a state. Most modes of a network's hidden state pass the first and weigh nothing
-    in the second.
+    A PBH test shows whether a mode is controllable (observable) at all. A Hankel singular value is the contribution of
+    a state to the response from past inputs to future outputs. Most modes of a network's hidden state are controllable
+    and observable, but their Hankel singular values are negligible.
 
     Args:
-        sys: The system, with a period.
+        sys: The discrete system.
 
     Raises:
         InputError: If the system has no period.
@@ -122,10 +125,10 @@ class FrequencyResponse:
 
 
 def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
-    """``C (e^{i w dt} I - A)^-1 B + D`` at the frequencies ``omega`` ``(n,)`` [rad/s].
+    """Compute ``C (e^{i w dt} I - A)^-1 B + D`` at the frequencies ``omega`` ``(n,)`` [rad/s].
 
     Raises:
-        InputError: If the system has no period or a frequency lies outside (0, pi / dt].
+        InputError: If the system has no period, or a frequency lies outside (0, pi / dt].
 
     Example:
         >>> import control
@@ -148,12 +151,12 @@ def frequency_response(sys: Any, omega: ArrayLike) -> FrequencyResponse:
 
 @dataclass(frozen=True)
 class SteadyGain:
-    """What the outputs come to under inputs that are held.
+    """Steady-state gain: change of the outputs for constant inputs.
 
     Args:
-        gain: ``(n_y, n_u)`` [output unit / input unit].
-        relative: Relative gains ``(n_y, n_u)`` [-] of a square system whose gain is not singular, else None. Near 1 an
-            input may be paired with an output; negative, its sign turns round when the other loops are closed.
+        gain: Gain ``(n_y, n_u)`` [output unit / input unit].
+        relative: Relative gains ``(n_y, n_u)`` [-]; None unless the gain is square and not singular. Near 1: the input
+            can be paired with the output. Negative: the sign of the gain changes when the other loops are closed.
     """
 
     gain: Array
@@ -161,10 +164,10 @@ class SteadyGain:
 
 
 def steady_gain(sys: Any) -> SteadyGain:
-    """``C (I - A)^-1 B + D`` of a discrete system, and its relative gains.
+    """Compute the gain ``G = C (I - A)^-1 B + D`` of a discrete system, and its relative gains ``G * (G^-1)'``.
 
     Raises:
-        InputError: If the system has no period, or a pole at 1: it integrates, and nothing holds still.
+        InputError: If the system has no period, or has a pole at 1 (an integrator has no steady state).
 
     Example:
         >>> import control
@@ -191,11 +194,11 @@ def steady_gain(sys: Any) -> SteadyGain:
 
 @dataclass(frozen=True)
 class Reduced:
-    """A reduced ``control.StateSpace`` of ``order`` states and what the reduction costs.
+    """A reduced ``control.StateSpace`` of ``order`` states, and the error of the reduction.
 
-    ``hankel`` are the singular values ``(n,)`` of the system before, infinite for poles on or outside the circle.
-    ``bound`` is the largest difference of the two frequency responses at most: twice the sum of the singular values
-    left out.
+    ``hankel`` are the Hankel singular values ``(n,)`` of the full system; infinite for poles on or outside the unit
+    circle. ``bound`` is an upper bound of the difference of the two frequency responses: twice the sum of the truncated
+    singular values.
     """
 
     system: Any
@@ -205,7 +208,7 @@ class Reduced:
 
 
 def hankel_singular_values(sys: Any) -> Array:
-    """Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for each unstable pole."""
+    """Compute the Hankel singular values ``(n,)`` of a discrete system, largest first; infinite for unstable poles."""
     period(sys)
     _, stable = _split(matrices(sys))
     values = _balance(*stable[:3])[0]
@@ -213,14 +216,14 @@ def hankel_singular_values(sys: Any) -> Array:
 
 
 def balanced_truncation(sys: Any, order: int) -> Reduced:
-    """The system with ``order`` states that balanced truncation leaves.
+    """Reduce a system to ``order`` states by balanced truncation.
 
-    Poles on or outside the unit circle are kept as they are; of the rest those states go that past inputs hardly
-    reach and future outputs hardly see. Scale inputs and outputs first (:func:`physical_states` does) if units differ.
+    Poles on or outside the unit circle are kept. Of the stable part, the states with the smallest Hankel singular
+    values are truncated. If units differ, scale inputs and outputs first (:func:`physical_states` does).
 
     Args:
         sys: Discrete ``control.StateSpace``.
-        order: States to keep; at least the number of poles that are not stable.
+        order: Number of states to keep, at least the number of poles on or outside the unit circle.
 
     Raises:
         InputError: If the system has no period, or the order does not fit.
@@ -263,26 +266,26 @@ def physical_states(
     model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None,
     *, x_scale: ArrayLike | None = None, u_scale: ArrayLike | None = None, system: Any = None,
 ) -> Reduced:  # fmt: skip
-    """The linearization with as many states as the machine has, which mean what the machine's mean.
+    """Reduce a linearization over ``(x, h)`` to the physical states ``x``.
 
-    Balanced truncation of the way from inputs to all physical states (scaled by ``x_scale``, ``u_scale``), then the
-    coordinates in which the reduced system's states are its approximations of these states. The hidden state's
-    slow part is folded in, the rest is within the bound.
+    First, balanced truncation of the response from inputs to all physical states (scaled by ``x_scale``, ``u_scale``).
+    Then a change of coordinates, so that the states of the reduced system approximate the physical states. The slow
+    part of the hidden state is included; the rest is within the bound.
 
     Args:
         model: The model.
         x: Operating point ``(n_x,)``.
         u: Input ``(n_u,)``.
         h: Hidden state ``(n_h,)``. Default: its equilibrium.
-        x_scale: Size of each state that counts as 1 ``(n_x,)``. Default: 1.
-        u_scale: Size of each input that counts as 1 ``(n_u,)``. Default: 1.
-        system: A linearization over ``(x, h)`` to reduce instead of the tangent at the point. Default: none.
+        x_scale: Scale of each state ``(n_x,)``. Default: 1.
+        u_scale: Scale of each input ``(n_u,)``. Default: 1.
+        system: Linearization over ``(x, h)`` to reduce instead of the tangent at the point. Default: none.
 
     Returns:
         The reduced system over ``x``, with the model's outputs; the bound is that of the scaled states' response.
 
     Raises:
-        InputError: If a size is wrong, or more poles are not stable than there are physical states.
+        InputError: If a size is wrong, or there are more poles on or outside the unit circle than physical states.
 
     Example:
         ``physical_states(model, [0.0, 0.0], [0.0], x_scale=[0.5, 2.0], u_scale=[0.2]).system.A``
@@ -324,7 +327,10 @@ def matrices(sys: Any) -> Matrices:
 
 
 def _split(given: Matrices) -> tuple[Matrices, Matrices]:
-    """The part with poles not inside the circle, and the stable part with D: an ordered Schur form, decoupled."""
+    """Split a system into the part with poles on or outside the unit circle, and the stable part with D.
+
+    An ordered real Schur form ``[[A1, A12], [0, A2]]`` is decoupled by the solution X of ``A1 X - X A2 = -A12``.
+    """
     a, b, c, d = given
     t, q, kept = schur(a, sort=lambda re, im: np.hypot(re, im) >= 1.0 - EDGE)
     if len(t) - kept == 0 or kept == 0:
@@ -339,7 +345,11 @@ def _split(given: Matrices) -> tuple[Matrices, Matrices]:
 
 
 def _balance(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
-    """Hankel singular values, and the projections ``W`` (rows) and ``T`` (columns) with ``W T = I``."""
+    """Hankel singular values, and the projections ``W`` (rows) and ``T`` (columns) with ``W T = I``.
+
+    With the Gramians ``P = R R'`` (controllability) and ``Q = S S'`` (observability), the singular values are those of
+    ``S' R`` (square-root method of Tombs and Postlethwaite).
+    """
     if not len(a):
         return np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
     reach = _root(solve_discrete_lyapunov(a, b @ b.T, method="bilinear"))
@@ -351,7 +361,7 @@ def _balance(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
 
 
 def _root(gramian: Array) -> Array:
-    """``R`` with ``R R' = gramian``; one that rounding left indefinite has its negative eigenvalues at zero."""
+    """``R`` with ``R R' = gramian``; negative eigenvalues, which are rounding errors, are set to zero."""
     symmetric = 0.5 * (gramian + gramian.T)
     try:
         return np.asarray(cholesky(symmetric, lower=True))

@@ -1,4 +1,4 @@
-"""How a trajectory moves when parameters of the model do."""
+"""Sensitivities of a free run to the parameters of the model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """A free run ``x`` ``(n + 1, n_x)`` and its derivatives ``by`` ``(n + 1, n_x, n_p)`` by parameters ``(n_p,)``."""
+    """A free run ``x`` ``(n + 1, n_x)`` and its derivatives ``by`` ``(n + 1, n_x, n_p)`` with respect to parameters."""
 
     names: tuple[str, ...]
     values: Array
@@ -27,15 +27,17 @@ class Sensitivities:
 
     @property
     def relative(self) -> Array:
-        """``(n + 1, n_x, n_p)``: change of the states per relative change of each parameter (1 is 100 %)."""
+        """Change of the states per relative change of each parameter (1 is 100 %), ``(n + 1, n_x, n_p)``."""
         return self.by * self.values
 
     def apart(self, sigma: ArrayLike, *, share: float = 0.05) -> Sensitivities:
-        """The parameters that this run tells apart, chosen one by one, each by what the ones before do not explain.
+        """Select the parameters that are identifiable together from this run, by a pivoted QR decomposition.
+
+        Each step selects the parameter whose effect has the largest part that the selected ones do not explain.
 
         Args:
             sigma: Standard deviation of each state's error ``(n_x,)``; infinite for states that are not measured.
-            share: A parameter is left out where less than this share of its own effect is not that of others, too.
+            share: A parameter is left out if less than this share of its effect is independent of the selected ones.
         """
         rows = self._rows(sigma)
         size = np.linalg.norm(rows, axis=0)
@@ -52,15 +54,15 @@ class Sensitivities:
         )
 
     def correlation(self, sigma: ArrayLike) -> Array:
-        """Correlation ``(n_p, n_p)`` that a least-squares fit of this run would leave between the parameters.
+        """Correlation ``(n_p, n_p)`` of the parameters' errors in a least-squares fit of this run.
 
-        Pairs near 1 or -1 cannot be told apart by it.
+        Two parameters with a correlation near 1 or -1 are not identifiable one by one.
 
         Args:
             sigma: As in :meth:`apart`.
 
         Raises:
-            InputError: If the run does not tell the parameters apart at all.
+            InputError: If the parameters are not identifiable together from this run.
         """
         rows = self._rows(sigma)
         size = np.linalg.norm(rows, axis=0)
@@ -78,13 +80,15 @@ class Sensitivities:
 def parameter_sensitivities(
     model: HybridModel, x: ArrayLike, u: ArrayLike, *, names: Sequence[str] | None = None
 ) -> Sensitivities:
-    """Exact derivatives of a free run by the prior's parameters, of a prior or of a hybrid.
+    """Compute exact derivatives of a free run with respect to the prior's parameters, for a prior or a hybrid.
+
+    ``dz_{k+1}/dp = (df/dz) dz_k/dp + df/dp`` with ``z_{k+1} = f(z_k, u_k, p)``.
 
     Args:
         model: The model.
-        x: Start ``(n_x,)``; a hidden state starts at zero.
+        x: Initial state ``(n_x,)``; a hidden state starts at zero.
         u: Inputs ``(n, n_u)``.
-        names: Which of the model's parameters. Default: all.
+        names: Names of the parameters. Default: all parameters of the model.
 
     Raises:
         InputError: If the model has no such parameter, a shape does not fit, or the run is not finite.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.control.problem import Controller, Solution, Status
+from hybrid_mpc.control.problem import Controller, Solution, Status, UnreachedBound
 from hybrid_mpc.control.soft import HardBound
 from hybrid_mpc.control.sqp import SQPController
 from hybrid_mpc.errors import InputError
@@ -87,7 +87,12 @@ def shortest_move(
 
     def reaches(n: int) -> bool:
         if n not in plans:
-            solver = controller(model, bounded.changed(horizon=n))
+            try:
+                solver = controller(model, bounded.changed(horizon=n))
+            except UnreachedBound:  # an input with a delay acts in longer plans only
+                if n >= longest:
+                    raise
+                return False
             plans[n] = solver.solve(solver.initial(estimate, None), estimate, row, None)
         return plans[n].status is Status.SOLVED and not plans[n].given_way
 

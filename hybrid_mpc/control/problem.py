@@ -115,6 +115,10 @@ class Solution:
         )
 
 
+class UnreachedBound(InputError):
+    """No input of the plan affects a value with a hard bound: the horizon is too short, or no input ever affects it."""
+
+
 class BoundRows:
     """The M soft and hard bounds of a problem along a trajectory, one row per bound and period.
 
@@ -186,7 +190,7 @@ class BoundRows:
         return int(self.stage.size)
 
     def _reached(self, model: HybridModel, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Bounds without those of hard rows that no input reaches; InputError if a name has no other row."""
+        """Bounds without those of hard rows that no input reaches; UnreachedBound if a name has no other row."""
         n = self._horizon
         states, values = _first_stages(model, self.functions)
         out = self.hard & (
@@ -194,7 +198,7 @@ class BoundRows:
         )
         kept = {self.names[row] for row in np.flatnonzero(self.hard & ~out)}
         if lost := {self.names[row] for row in np.flatnonzero(out)} - kept:
-            raise InputError(
+            raise UnreachedBound(
                 f"hard bound on {', '.join(sorted(lost))}: no input of the plan affects it. Bound a value that "
                 "inputs change within the horizon. [HM-CONTROL-030]"
             )

@@ -1,4 +1,4 @@
-"""A model's step cut at its network: scalar code, a GRU's weights or those of layers, scalar code."""
+"""Cut of a model's step at its network: scalar code, weights of a GRU or of layers, scalar code."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
 MOST_SCALARS = 10_000
-"""Operations before or behind a cell beyond which networks among them are taken as layers."""
+"""Maximum scalar operations before or behind a GRU cell; with more, all networks are exported as layers."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Weights of a GRU in torch's form, gates r, z, n one below the other, and its first state's place in ``h``."""
+    """Weights of a GRU in torch's form, gates r, z, n one below the other, and index of its first state in ``h``."""
 
     input_weight: Array
     hidden_weight: Array
@@ -35,7 +35,7 @@ class Cell:
         return int(self.hidden_weight.shape[1])
 
     def same(self, other: Cell | None) -> bool:
-        """Whether it is the other one, too."""
+        """Whether both cells have the same weights and states."""
         names = ("input_weight", "hidden_weight", "input_bias", "hidden_bias")
         return (
             other is not None
@@ -46,9 +46,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Cut:
-    """A step, or rates, in scalars. ``before`` ``(x, h, u, w) -> features`` and ``cell`` are those of a network that is
-    one GRU, ``layers`` those of any other; ``after`` ``(x, h, u, w, units) -> z_next`` takes the cell's new state, or
-    the products of all layers.
+    """A step, or rates, as scalar code and network.
+
+    Args:
+        before: ``(x, h, u, w) -> features`` of a network that is one GRU; else None.
+        cell: Weights of that GRU; else None.
+        after: ``(x, h, u, w, units) -> z_next``; ``units`` is the cell's new state, or the products of all layers.
+        layers: Layers of any other network. Default: none.
     """
 
     before: ca.Function | None
@@ -58,10 +62,10 @@ class Cut:
 
 
 def cut(model: HybridModel, of: str = "step", *, layered: bool = False) -> Cut:
-    """The step of a model, or its rates (``of="xdot"``), its parameters at their values; ``layered``: a GRU as layers.
+    """Cut the step of a model, or its rates (``of="xdot"``), with constant parameters; ``layered``: a GRU as layers.
 
     Raises:
-        InputError: If what lies between its layers is no scalar code.
+        InputError: If the part between the layers cannot be written as scalar code.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal
@@ -91,8 +95,10 @@ def cut(model: HybridModel, of: str = "step", *, layered: bool = False) -> Cut:
 
 
 def _gru(model: HybridModel, of: str, point: list[ca.MX], z_next: ca.MX, call: ca.MX) -> Cut | None:
-    """The step cut at its only cell; None where it is not cut there: the cell goes on from something else than its own
-    hidden state, or a network behind it is no scalar code.
+    """Cut a step at its only GRU cell.
+
+    None if this is not possible: the cell's previous state is not a part of the model's hidden state, or the scalar
+    code is too large.
     """
     seen: ca.MX = call.dep(0)
     hidden, new = call.dep(1), call.get_output(0)
@@ -113,7 +119,7 @@ def _gru(model: HybridModel, of: str, point: list[ca.MX], z_next: ca.MX, call: c
 
 
 def _kept(model: HybridModel, found: Cut) -> bool:
-    """Whether the cell's new state is the next hidden state as it is, unit by unit."""
+    """Whether the cell's new state is the next hidden state without changes, unit by unit."""
     point = [ca.SX.sym(n, found.after.numel_in(i)) for i, n in enumerate(("x", "h", "u", "w", "units"))]
     z_next, g = found.after(*point), point[-1]
     own = next_places(z_next, g)
@@ -122,7 +128,7 @@ def _kept(model: HybridModel, found: Cut) -> bool:
 
 
 def next_places(z_next: ca.SX, units: ca.SX) -> dict[int, int]:
-    """Which entries of a step are units of the cell as they are: the unit by the entry's place."""
+    """Entries of a step that equal a unit of the cell: number of the unit by index of the entry."""
     pairs = ((i, k) for i in range(z_next.numel()) for k in range(units.numel()))
     return {i: k for i, k in pairs if ca.is_equal(z_next[i], units[k], 0)}
 
@@ -138,7 +144,7 @@ def _scalar(model: HybridModel, name: str, point: list[ca.MX], value: ca.MX) -> 
 
 
 def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int | None:
-    """Place in ``h`` of the first state that the cell goes on from; None if these are others."""
+    """Index in ``h`` of the cell's first previous state; None if the previous state is not a part of ``h``."""
     h = point[1]
     slope = ca.Function("slope", point, [ca.densify(ca.jacobian(hidden, h)), hidden])
     rng = np.random.default_rng(0)
@@ -154,7 +160,7 @@ def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int | None:
 
 
 def _weights(cell: ca.Function) -> tuple[Array, Array, Array, Array]:
-    """Weights and biases of the input and of the hidden state, read off the cell's two products."""
+    """Read weights and biases of the input and of the hidden state from the cell's two products."""
     found = {}
     for k in range(cell.n_instructions()):
         if cell.instruction_id(k) == ca.OP_MTIMES:
@@ -177,11 +183,13 @@ def _weights(cell: ca.Function) -> tuple[Array, Array, Array, Array]:
 def reduced(
     parts: Cut, model: HybridModel, rest: list[int], z: ca.SX, u: ca.SX, w: ca.SX
 ) -> tuple[Array, ca.SX, ca.SX]:
-    """What the step sees of the cell's new state: ``head`` ``(k, units)``, symbols of the k combinations, and the step
-    with them in place of the units.
+    """Reduce the cell's new state to the linear combinations that the rest of the step depends on.
 
-    A linear layer behind the cell lets through as many as it has outputs: the row space of the Jacobian, the same at
-    all points. Writing it out unit by unit would make scalar code that grows with the network.
+    A linear layer with k outputs behind the cell passes on k combinations: the row space of the Jacobian, which is the
+    same at all points. Scalar code for all units instead would grow with the network.
+
+    Returns:
+        ``head`` ``(k, units)``, symbols of the k combinations, and the step as a function of these combinations.
     """
     assert parts.cell is not None
     units, n_x = parts.cell.units, model.n_x
@@ -216,7 +224,7 @@ def reduced(
 
 
 def _pivots(rows: Array) -> list[int]:
-    """Columns of full rank of ``(k, n)`` rows of full rank."""
+    """Indices of k linearly independent columns of a matrix ``(k, n)`` of rank k."""
     left, chosen = rows.copy(), []
     for _ in range(len(rows)):
         sizes = np.linalg.norm(left, axis=0)

@@ -1,4 +1,4 @@
-"""A folder with the C of a controller: sources, vectors that a test program replays, and a README with its sizes."""
+"""Folder with the C of a controller: sources, vectors for a test program, and a README with sizes."""
 
 from __future__ import annotations
 
@@ -40,34 +40,35 @@ Array = NDArray[np.float64]
 VECTORS = 25
 """Periods that the test program replays."""
 TOLERANCE = {False: 1e-9, True: 1e-3}
-"""Of inputs by their range and of states by their size; of single precision what its seven digits leave of a QP."""
+"""Tolerance of the test, double and single precision: inputs over their range, states over their size. In single
+precision (seven digits) the QP limits the accuracy."""
 OTHERS = ("hmpc_test.c", "Makefile", "CMakeLists.txt")
 MONITOR_README = """\
-`hmpc_finish` looks at the period by @WATCHED@: `s.monitor.alarm` says whether anything alarms, the fields beside it
-what. @REACTION@
+`hmpc_finish` runs the monitor on @WATCHED@. `s.monitor.alarm` is 1 during an alarm; the other fields of `s.monitor`
+show its cause. @REACTION@
 
 """
 REACTS = """\
-The guard reacts in the next `hmpc_step`: `s.guard.mode` is who decides,
-`s.guard.why` what led there."""
+The guard reacts in the next `hmpc_step`: `s.guard.mode` is its mode,
+`s.guard.why` the reason."""
 REACTIONS = {
-    "none": "Nothing reacts: what an alarm means is up to the caller.",
+    "none": "There is no guard: the caller reacts to an alarm.",
     "guard": REACTS,
-    "backup": f"""{REACTS} Its second controller, with an estimator of its own, is `hmpb_state backup` in
-the state; its files and names begin with `hmpb`. Its estimator runs in every period too,
-which the table does not count.""",
+    "backup": f"""{REACTS} The backup controller and its observer are `hmpb_state backup` in the state;
+their files and names begin with `hmpb`. The observer of the backup also runs in every period;
+the table does not include it.""",
 }
 TARGETS_README = """\
-The goal is one of outputs, `goal.y`. Their steady state is sought in every step (`s.steady`): from the last one in two
-or three steps, where a set-point or a disturbance jumps in some more, and where there is none from every start, up to
-`HMPC_TARGET_ITERATIONS` from each.
+The set-point is one of outputs, `goal.y`. Every step computes its steady state (`s.steady`), starting from the previous
+one: two or three iterations, and more after a jump of set-point or disturbance. If this fails, the search starts from
+every start point, with at most `HMPC_TARGET_ITERATIONS` iterations each.
 
 """
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """What a compiler makes of a controller [bytes]: code and tables, the state, and all frames of its functions."""
+    """Memory of a compiled controller [bytes]: code and tables, state, and the sum of all stack frames."""
 
     flash: int
     state: int
@@ -79,14 +80,14 @@ def write_controller(
     fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
     monitor: Monitor | None = None, guard: Guard | None = None, check: bool = False,
 ) -> Sources:  # fmt: skip
-    """Write the C of a controller, its test and its README; arguments as :func:`make_sources` takes them.
+    """Write the C of a controller, its test and its README; the arguments are those of :func:`make_sources`.
 
-    With ``check`` the C is compiled and its test is run before it takes its place, and the README has its sizes;
-    without, nothing of it is compiled or run.
+    With ``check``, the C is compiled and its test runs before the folder is replaced, and the README holds the sizes.
+    Without ``check``, nothing is compiled or run.
 
     Raises:
-        InputError: If something has no C, by name, before anything is written; if the check fails.
-        StorageError: If it cannot be written; the folder is then as it was.
+        InputError: If a part cannot be exported as C (before anything is written), or the check fails.
+        StorageError: If the folder cannot be written; it is then unchanged.
     """
     found = make_sources(
         model, ocp, estimator=estimator, fallback=fallback, safe_input=safe_input, single=single, monitor=monitor,
@@ -106,7 +107,7 @@ def write_controller(
 
 
 def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monitor: Monitor | None) -> str:
-    """A short loop from the operating point towards a set-point beside it, on the model itself."""
+    """Test vectors: a short loop on the model itself, from the operating point towards a set-point near it."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.sizes.states
     tolerated = (
@@ -149,13 +150,13 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monit
         tables.append(table("vector_reading_size", np.where(largest > 0, largest, 1.0)))
     head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({TOLERANCE[single]!r})\n"
     return (
-        "/* What the Python controller decided in a short loop, generated. */\n"
+        "/* Decisions of the Python controller in a short loop, generated. */\n"
         f"#ifndef HMPC_VECTORS_H\n#define HMPC_VECTORS_H\n{head}{''.join(tables)}#endif\n"
     )
 
 
 def _numbers(reading: Reading) -> Array:
-    """What of a monitor's reading the test program compares: whether it alarms, and its values."""
+    """Numbers of a monitor's reading that the test program compares: alarm, and the channels' values."""
     return np.array([float(reading.alarm), *reading.values])
 
 
@@ -165,10 +166,10 @@ def _noise(estimator: Filter) -> Array:
 
 
 def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
-    """Compile the sources ``names`` by gcc -O3, run the test program, and measure them for this machine.
+    """Compile the sources ``names`` with gcc -O3, run the test program, and measure the memory on this machine.
 
     Raises:
-        InputError: If there is no gcc, it fails, or the test does.
+        InputError: If gcc is not installed, the compilation fails, or the test fails.
     """
     gcc, size = shutil.which("gcc"), shutil.which("size")
     if gcc is None or size is None:
@@ -207,7 +208,7 @@ def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
 
 
 def _watching(n: Mapping[str, int], code: Mapping[str, int], step: int) -> int:
-    """Operations of a period of the monitor, near rest, where the energy asks the model most."""
+    """Operations of the monitor in one period: the maximum, which the energy balance needs near rest."""
     if n["MONITOR"] == 2:
         return 3 * step + code.get("watched_balances", 0) + n["LIMITS"] * n["LONGEST"]
     rows = n["WINDOW"] * (7 * n["NX"] + 2 * (n["NU"] + n["NW"]))
@@ -221,7 +222,7 @@ def _watching(n: Mapping[str, int], code: Mapping[str, int], step: int) -> int:
 
 def _monitor_readme(sizes: Mapping[str, int]) -> str:
     if not sizes["MONITOR"]:
-        return "Nothing watches the loop: it was generated without a monitor.\n\n"
+        return "There is no monitor: the controller was generated without one.\n\n"
     watched = (
         "the energy balance of the model" if sizes["MONITOR"] == 1 else "residuals of outputs and balances"
     )
@@ -230,7 +231,7 @@ def _monitor_readme(sizes: Mapping[str, int]) -> str:
 
 
 def operations(found: Sources) -> dict[str, int]:
-    """Additions and multiplications of a period, by part; of the QP for one iteration."""
+    """Additions and multiplications of one period, by part; for the QP those of one iteration."""
     n, code = found.sizes, found.operations
     n_z, n_v, units = n["NX"] + n["NH"], n["BLOCKS"] * n["NU"], n["UNITS"]
     padded = -(-n_z // 8) * 8
@@ -248,7 +249,7 @@ def operations(found: Sources) -> dict[str, int]:
     n_e = n_z + n["ND"]
     n_t = n_z + n["NU"]
     newton = 2 * n_z**2 * n_t + 4 * n_z * n_t * n["NU"] + 2 * n["NH"] ** 3 // 3
-    search = {"step: steady state, a step of its search": stage + newton} if n["OUTPUT_COST"] else {}
+    search = {"step: steady state, one iteration": stage + newton} if n["OUTPUT_COST"] else {}
     step_only = (
         stage - units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) - 2 * n["HEAD"] * units * (padded + n["NU"])
     )
@@ -262,7 +263,7 @@ def operations(found: Sources) -> dict[str, int]:
             "prepare: Hessian and its factor": int(n["NX"] * np.sum(active**2)) + n_v**3,
             "step: estimator": n["MODES"] * (stage + 4 * n_e * padded * n_e + 2 * n["MODES"] * n_e**2),
             "step: free response, gradient, bounds": 2 * n["N"] * n_z * padded + 6 * n["N"] * n["NX"] * n_v,
-            "step: QP, an iteration": 4 * n_v**2 + 2 * n_v * n["N"] * (n["SOFT_X"] + n["SOFT_E"]),
+            "step: QP, one iteration": 4 * n_v**2 + 2 * n_v * n["N"] * (n["SOFT_X"] + n["SOFT_E"]),
         }
     )
 
@@ -271,22 +272,20 @@ def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single:
     n = found.sizes
     rows = "".join(f"| {name} | {count:,} |\n" for name, count in operations(found).items())
     if sizes is None:
-        memory = (
-            "Not measured: this was generated without `--check`. `make test` prints the size of the state.\n"
-        )
+        memory = "Not measured: generated without `--check`. `make test` prints the size of the state.\n"
     else:
         memory = (
             "| | bytes |\n| --- | ---: |\n"
             f"| flash: code and tables | {sizes.flash:,} |\n| RAM: one `hmpc_state` | {sizes.state:,} |\n"
-            f"| stack: all frames, an upper bound (nothing recurses) | {sizes.stack:,} |\n\n"
-            "By `gcc -O3` for the machine on which this was generated.\n"
+            f"| stack: sum of all frames, an upper bound (no recursion) | {sizes.stack:,} |\n\n"
+            "Compiled with `gcc -O3` on the machine that generated the controller.\n"
         )
     values: Mapping[str, object] = {
         "NAME": markdown(model.name), "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
         "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
         "DT": model.dt, "TOLERANCE": TOLERANCE[single],
         "MONITOR": _monitor_readme(n), "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
-        "ESTIMATOR": f"{n['MODES']} Kalman filters side by side" if n["MODES"] else "none: it is given an estimate",
+        "ESTIMATOR": f"{n['MODES']} parallel Kalman filters" if n["MODES"] else "none, the caller passes an estimate",
         "FILES": ", ".join(f"`{name}`" for name in GENERATED),
     }  # fmt: skip
     return re.sub("@([A-Z]+)@", lambda found: str(values[found[1]]), template("README.md"))

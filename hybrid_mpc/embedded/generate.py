@@ -1,4 +1,4 @@
-"""C of a controller: sizes, tables and scalar code beside the sources in ``c/``, the same for all machines."""
+"""Generated C of a controller: sizes, tables and scalar code. The sources in ``c/`` are the same for all machines."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
 CORE = ("hmpc_model.c", "hmpc_qp.c", "hmpc_targets.c", "hmpc_mpc.c", "hmpc_estimator.c")
-"""A controller and its estimator: what a guard's backup has, too, under names of its own."""
+"""Sources of a controller and its observer; a guard's backup has the same sources with the prefix :data:`BACKUP`."""
 SOURCES = (*CORE, "hmpc_monitor.c", "hmpc_loop.c")
 HEADERS = ("hmpc.h", "hmpc_math.h")
 BACKUP = "hmpb"
-"""What names of a guard's backup begin with, in place of ``hmpc``."""
+"""Prefix of the names of a guard's backup, instead of ``hmpc``."""
 GENERATED = ("hmpc_config.h", "hmpc_tables.h", "hmpc_expressions.h")
 FIRST = 25
-"""Iterations of the first plan: an RTI step halves what is left, or better."""
+"""Real-time iterations of the first plan; each one at least halves the error."""
 SEARCH: Mapping[str, tuple[str, str]] = {
     "STEADY": (repr(equilibrium.STEADY), "1e-5"), "STILL": (repr(equilibrium.STILL), "1e-4"),
     "NEAR": (repr(equilibrium.NEAR), "1e-3"), "REACHED": (repr(equilibrium.REACHED), "1e-3"),
@@ -58,19 +58,19 @@ SEARCH: Mapping[str, tuple[str, str]] = {
     )}, "VIOLATED": ("1e-12", "1e-6"),
     "ROUNDING": ("1e-15", "1e-7"), "AWAY": (repr(equilibrium.AWAY), repr(equilibrium.AWAY)),
 }  # fmt: skip
-"""What the search for steady states goes by, in double and in single precision: ``hybrid_mpc.model.equilibrium``."""
+"""Constants of the search for steady states (``hybrid_mpc.model.equilibrium``), in double and in single precision."""
 START: Mapping[str, tuple[str, str]] = {
     "FITS": (repr(kalman.FITS), "1e-2"), "EXACT": (repr(kalman.EXACT), "1e-3"),
     "DEPENDENT": (repr(kalman.DEPENDENT), "1e-5"),
 }  # fmt: skip
-"""Likewise the search for the first state that fits the sensors: ``hybrid_mpc.estimate.kalman``."""
+"""Constants of the search for an initial state that fits the sensors (``hybrid_mpc.estimate.kalman``), likewise."""
 MAX_AGE = 5
-"""Periods a plan is followed without a successful solve, as :class:`~hybrid_mpc.control.safeguard.SafeController`."""
+"""Maximum periods of a plan without a successful solve, as in :class:`~hybrid_mpc.control.safeguard.SafeController`."""
 
 
 @dataclass(frozen=True)
 class Sources:
-    """C of a controller: the generated files' texts by name, and how many scalar operations they hold by function."""
+    """C of a controller: texts of the generated files by name, scalar operations by function, and sizes by name."""
 
     texts: Mapping[str, str]
     operations: Mapping[str, int]
@@ -82,21 +82,21 @@ def make_sources(
     safe_input: Array | None = None, single: bool = False, monitor: Monitor | None = None, guard: Guard | None = None,
     max_age: int = MAX_AGE,
 ) -> Sources:  # fmt: skip
-    """The generated files of a controller; with a guard's backup all files of that one, too.
+    """Generate the files of a controller; with a guard's backup, also all files of the backup.
 
     Args:
-        model: The model that plans, and estimates.
+        model: The model of controller and observer.
         ocp: The control problem.
-        estimator: Default: none; the C then starts from an estimate that is handed to it.
+        estimator: The observer. Default: none; the caller of the C then passes an estimate.
         fallback: The prior, see :class:`~hybrid_mpc.control.safeguard.SafeController`. Default: none.
-        safe_input: Likewise.
-        single: Whether numbers are ``float``. Default: ``double``.
-        monitor: What watches the loop; it needs the estimator. Default: nothing.
-        guard: What an alarm of it does. Default: nothing.
+        safe_input: Safe input ``(n_u,)``, see there. Default: none.
+        single: True: numbers are ``float``. Default: ``double``.
+        monitor: The monitor; it needs the observer. Default: none.
+        guard: The guard, which reacts to alarms. Default: none.
         max_age: See :class:`~hybrid_mpc.control.safeguard.SafeController`.
 
     Raises:
-        InputError: If something of them has no C, all at once, by name.
+        InputError: If a part cannot be exported as C; lists all such parts together.
     """
     refused = _refused(ocp, estimator, single)
     parts: Cut | None = None
@@ -108,7 +108,7 @@ def make_sources(
     if monitor is not None:
         refused += refused_monitor(monitor, model)
         refused += (
-            [] if estimator is not None else ["a monitor without an estimator, whose estimates it reads"]
+            [] if estimator is not None else ["a monitor without an estimator: it needs the state estimate"]
         )
     if guard is not None:
         refused += refused_guard(guard, monitor is not None, model, ocp, safe_input)
@@ -160,7 +160,7 @@ def make_sources(
 
 
 def backup_of(guard: Guard | None, single: bool) -> dict[str, str]:
-    """All files of a guard's backup, its names with a prefix of their own; none without one.
+    """Generate all files of a guard's backup, named with the prefix :data:`BACKUP`; empty without a backup.
 
     Raises:
         InputError: As :func:`make_sources`.
@@ -173,20 +173,20 @@ def backup_of(guard: Guard | None, single: bool) -> dict[str, str]:
         safe_input=safe.safe_input, single=single, max_age=safe.max_age,
     )  # fmt: skip
     texts = {name: template(name) for name in (*HEADERS, *CORE)} | dict(found.texts)
-    return {_renamed(name): _renamed(text) for name, text in texts.items()}
+    return {_rename(name): _rename(text) for name, text in texts.items()}
 
 
-def _renamed(text: str) -> str:
+def _rename(text: str) -> str:
     return text.replace("hmpc", BACKUP).replace("HMPC", BACKUP.upper())
 
 
 def sources_of(found: Sources) -> tuple[str, ...]:
     """Names of all files to compile."""
-    return (*SOURCES, *(_renamed(name) for name in CORE if found.sizes["BACKUP"]))
+    return (*SOURCES, *(_rename(name) for name in CORE if found.sizes["BACKUP"]))
 
 
 def _refused(ocp: OCP, estimator: object, single: bool) -> list[str]:
-    """What of a control problem and an estimator has no C, in words."""
+    """Texts about the parts of a control problem and an observer that cannot be exported as C."""
     found = []
     if not isinstance(estimator, ExtendedKalmanFilter | SwitchingFilter | None):
         found.append(
@@ -195,14 +195,14 @@ def _refused(ocp: OCP, estimator: object, single: bool) -> list[str]:
         )
     if ocp.hard and single:
         found.append(
-            "hard bounds in single precision: where one gives way, seven digits leave none beside its penalty; "
-            "generate double precision"
+            "hard bounds in single precision: the penalty of a relaxed bound is 1e5 times larger than the cost, and "
+            "seven digits leave no accuracy for the cost; generate double precision"
         )
     return found
 
 
 def _curved(model: HybridModel) -> bool:
-    """Whether outputs are not linear in state and input, or answer to these as measured disturbances say."""
+    """Whether the outputs' slopes by state and input are not constant: they depend on state, input or disturbances."""
     point = [ca.SX.sym(name, n) for name, n in (("x", model.n_x), ("u", model.n_u), ("w", model.n_w))]
     y = _scalar("the output", model.output)(*point, ca.DM(model.p))
     return bool(ca.depends_on(ca.jacobian(y, ca.vertcat(*point[:2])), ca.vertcat(*point)))
@@ -213,19 +213,19 @@ def _modes(estimator: Filter) -> tuple[ExtendedKalmanFilter, ...]:
 
 
 def kinds_of(soft: BoundRows, horizon: int) -> list[int]:
-    """The rows of the last period, where all bounds hold: of the states' bounds, then of each expression's."""
+    """Rows of the last period, in which all bounds hold: the states' bounds, then those of each expression."""
     sizes = [soft.states.size, *(int(f.numel_out(0)) for f in soft.functions)]
     ends = horizon * np.cumsum(sizes)
     return [row for end, size in zip(ends, sizes, strict=True) for row in range(end - size, end)]
 
 
 def bound_names(soft: BoundRows, horizon: int) -> list[str]:
-    """Names of the hard bounds by their place in ``given_way``, empty for soft ones."""
+    """Names of the hard bounds in the order of ``given_way``; empty for soft bounds."""
     return [soft.names[row] if soft.hard[row] else "" for row in kinds_of(soft, horizon)]
 
 
 def _first_periods(soft: BoundRows, horizon: int) -> list[int]:
-    """The first period in which each bound holds, by its place among those of a period."""
+    """First period in which each bound holds, in the order of a period's bounds."""
     bounded = np.isfinite(soft.lower) | np.isfinite(soft.upper)
     first, at = [], 0
     for size in (soft.states.size, *(int(f.numel_out(0)) for f in soft.functions)):
@@ -239,7 +239,7 @@ def _config(sizes: Mapping[str, int], single: bool, names: list[str], watched: W
     defined = "".join(f"#define HMPC_{name} {value}\n" for name, value in sizes.items())
     hard = "".join(f"   {i}: {comment(name)}\n" for i, name in enumerate(names) if name)
     defined += f"/* Hard bounds by their place in given_way:\n{hard}*/\n" if hard else ""
-    # A float has seven digits: the QP is as exact as that allows.
+    # tolerances of the QP in single precision follow from the seven digits of a float
     exact = ("2e-5", "1e-4", "2e-3", "1e-3", "1e-3") if single else (
         "1e-10", "1e-12", repr(KKT_TOLERANCE), repr(BOUND_TOLERANCE), repr(KEPT)
     )  # fmt: skip
@@ -271,7 +271,7 @@ def _expressions(
     asked: Mapping[str, int],
     watched: str,
 ) -> tuple[str, dict[str, int], dict[str, int]]:
-    """The scalar code, sizes that follow from it, and its operations by function."""
+    """The scalar code, the sizes that follow from it, and its operations by function."""
     n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
     n_z = n_x + n_h
     padded = -(-n_z // 8) * 8
@@ -305,7 +305,7 @@ def _expressions(
         sizes |= {
             "FEATURES": seen.numel(), "SEEN_SLOPES": len(values), "HIDDEN": n_x + cell.first, "HIDDEN_NEXT": first,
         }  # fmt: skip
-        # the hidden state's weights row by row for the Jacobian, and column by column for the values
+        # weights row by row for the Jacobian, and column by column for the values
         gates = -(-3 * units // 8) * 8
         sizes["GATES"] = gates
         weights = {"input_weight": cell.input_weight, "hidden_weight": cell.hidden_weight}
@@ -418,7 +418,7 @@ def _scalar(what: str, f: ca.Function) -> ca.Function:
 
 
 def target_starts(own: Targets | None) -> Array:
-    """Where descents of the target calculator begin, a row each: the operating point first, the run's end last."""
+    """Start points of the target calculator, one row each: the operating point first, the end of the run last."""
     return np.zeros((0, 0)) if own is None else np.array([*own.beside, *own.run_out])
 
 
@@ -426,7 +426,7 @@ def _tables(
     model: HybridModel, ocp: OCP, problem: Problem, soft: BoundRows, fallback: HybridModel | None,
     safe_input: Array | None, estimator: Filter | None, watched: str,
 ) -> str:  # fmt: skip
-    """All numbers of the problem and the estimator, and those of monitor and guard as they are given."""
+    """Tables of problem, observer, monitor and guard."""
     dt, n = model.dt, ocp.horizon
     on_u, on_x, on_y = model.disturbed
     starts = ocp.block_starts
@@ -485,5 +485,5 @@ def _tables(
 
 
 def template(name: str) -> str:
-    """A source that is the same for all controllers."""
+    """Read a source that is the same for all controllers."""
     return (files("hybrid_mpc.embedded") / "c" / name).read_text()

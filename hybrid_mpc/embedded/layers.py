@@ -1,4 +1,4 @@
-"""A model's networks as products with constant matrices, with scalar code between them: any network of nn_export."""
+"""Networks of a model as products with constant matrices and scalar code between them, for all of nn_export's."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
 FEW = 4
-"""Derivatives of a layer's argument, in a row, up to which they are looked at one by one."""
+"""Maximum number of derivatives of an element of a layer's argument that are multiplied one by one."""
 
 
 Entry = tuple[int, int, ca.SX]
 """Row, column and expression of a derivative."""
 Owner = tuple[int, int, int, tuple[int, ...]]
-"""Of a layer the first product, their number, the place of its derivatives, and by which columns these are."""
+"""For a layer: index of its first product, number of products, offset of its derivatives, and their columns."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Layer:
 
 
 def split(point: Sequence[ca.MX], value: ca.MX, what: str) -> tuple[tuple[Layer, ...], ca.Function]:
-    """The layers of an expression at ``point``, in order, and ``(*point, all products) -> value``.
+    """Split an expression at ``point`` into its layers, in order, and ``(*point, all products) -> value``.
 
     Raises:
-        InputError: If what lies between them is no scalar code.
+        InputError: If the part between the layers cannot be written as scalar code.
     """
     whole = written_out(point, value)
     products = _products(point, whole)
@@ -49,7 +49,7 @@ def split(point: Sequence[ca.MX], value: ca.MX, what: str) -> tuple[tuple[Layer,
     new: list[ca.MX] = []
     for node in products:
         bias, left, right = (node.dep(i) for i in range(3))
-        turned = bool(ca.symvar(left))  # X W' of samples in rows
+        turned = bool(ca.symvar(left))  # X W', with samples in rows
         weight = ca.evalf(right.T if turned else left).full()
         samples, addend = ca.graph_substitute([left.T if turned else right, bias], old, new)
         columns = []
@@ -82,7 +82,7 @@ def _scalar(what: str, given: Sequence[ca.MX], value: ca.MX) -> ca.Function:
 
 
 def written_out(point: Sequence[ca.MX], value: ca.MX, but: str = "\0") -> ca.MX:
-    """An expression whose calls of graphs are written out, but for functions whose names end with ``but``."""
+    """Inline the calls of graphs in an expression, except functions whose names end with ``but``."""
     while True:
         whole = ca.Function("whole", list(point), [value])
         for k in range(whole.n_instructions()):
@@ -99,7 +99,7 @@ def written_out(point: Sequence[ca.MX], value: ca.MX, but: str = "\0") -> ca.MX:
 
 
 def _products(point: Sequence[ca.MX], value: ca.MX) -> list[ca.MX]:
-    """Products with large constant matrices, in order."""
+    """Products of an expression with large constant matrices, in order."""
     whole = ca.Function("whole", list(point), [value])
     nodes = [(whole.instruction_id(k), whole.instruction_MX(k)) for k in range(whole.n_instructions())]
     return [n for code, n in nodes if code == ca.OP_MTIMES and _large(n)]
@@ -111,14 +111,14 @@ def _large(product: ca.MX) -> bool:
 
 
 def _results(f: ca.Function) -> list[ca.MX]:
-    """What a graph computes of its own symbols; a call of a function that is not to be inlined would not say."""
+    """Results of a graph as expressions of its own symbols, with the calls of other functions kept."""
     slots: dict[int, Any] = {}
     found: list[list[ca.MX]] = [[] for _ in range(f.n_out())]
     inputs = [ca.vec(v) for v in f.mx_in()]
     for k in range(f.n_instructions()):
         code, taken, made = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         node = f.instruction_MX(k)
-        if code == ca.OP_OUTPUT:  # what is joined there comes in pieces, in order
+        if code == ca.OP_OUTPUT:  # the pieces of an output come in order
             found[made[0]].append(ca.vec(slots[taken[0]]))
         elif code == ca.OP_INPUT:
             first = int(node.info()["offset"])
@@ -133,32 +133,39 @@ def _results(f: ca.Function) -> list[ca.MX]:
 
 @dataclass(frozen=True)
 class LayerCode:
-    """C of layers: tables and functions, the number of products, and reals that their derivatives take."""
+    """C of layers.
+
+    Args:
+        text: Tables and functions.
+        products: Number of products.
+        through: Number of reals that the derivatives need.
+        operations: Scalar operations by function.
+        owners: Indices of each layer.
+    """
 
     text: str
     products: int
     through: int
     operations: dict[str, int]
     owners: tuple[Owner, ...]
-    """Of each layer."""
 
 
 def layer_code(
     name: str, layers: Sequence[Layer], symbols: Sequence[ca.SX], places: Sequence[int], *, slopes: bool = True,
     known: Mapping[bytes, str] | None = None,
 ) -> LayerCode:  # fmt: skip
-    """Functions ``{name}(z, u, w, m)``, and with ``slopes`` ``{name}_slope(z, u, w, m, through)``.
+    """Write the functions ``{name}(z, u, w, m)`` and, with ``slopes``, ``{name}_slope(z, u, w, m, through)``.
 
     Args:
-        name: What names begin with.
-        layers: In order.
+        name: Prefix of all names.
+        layers: The layers, in order.
         symbols: ``z, u, w`` of the model, as scalars.
-        places: Columns of the Jacobian by ``(z, u)``.
-        slopes: Whether derivatives are needed, too.
-        known: Weights that have a table, by their content (:func:`tables_of`). Default: none.
+        places: Column in the Jacobian of each entry of ``(z, u)``.
+        slopes: True: also write derivatives. Default: True.
+        known: Names of existing tables by the content of their weights (:func:`tables_of`). Default: none.
 
     Raises:
-        InputError: If an operation has no C, or there are too many.
+        InputError: If an operation cannot be written as C, or there are too many operations.
     """
     z, u, w = symbols
     sizes = [len(layer.weight) for layer in layers]
@@ -248,7 +255,7 @@ def layer_code(
 
 
 def tables_of(name: str, layers: Sequence[Layer]) -> dict[bytes, str]:
-    """Names of the tables that :func:`layer_code` makes of weights, by their content."""
+    """Names of the tables that :func:`layer_code` writes, by the content of their weights."""
     found: dict[bytes, str] = {}
     for i, layer in enumerate(layers):
         found.setdefault(_key(layer), f"{name}{i}_weight")
@@ -260,13 +267,13 @@ def _key(layer: Layer) -> bytes:
 
 
 def _entries(matrix: ca.SX) -> list[Entry]:
-    """Row, column and expression of what is not always zero."""
+    """Row, column and expression of the structural nonzeros of a matrix."""
     rows, columns = matrix.sparsity().get_triplet()
     return [(r, c, matrix[r, c]) for r, c in zip(rows, columns, strict=True)]
 
 
 def _passed(by_m: ca.SX, owners: Sequence[Owner]) -> dict[int, list[Entry]]:
-    """Derivatives by products, by the layer that these are of."""
+    """Derivatives with respect to the products, by layer of the product."""
     found: dict[int, list[Entry]] = {}
     ends = [first + n for first, n, *_ in owners]
     for r, c, value in _entries(by_m):
@@ -279,7 +286,7 @@ def _pass(
     name: str, owner: Owner, chosen: Sequence[Entry], onto: Sequence[int],
     at: int, to: str, stride: int | str,
 ) -> tuple[str, str]:  # fmt: skip
-    """Tables and the statement that adds a layer's derivatives, times those by its products, to others."""
+    """Tables, and a statement of the chain rule that adds a layer's derivatives times the ``chosen`` ones to others."""
     first, _, through, active = owner
     text = table(f"{name}_at", [r for r, *_ in chosen], "int")
     text += table(f"{name}_from", [c - first for _, c, _ in chosen], "int") + table(
@@ -295,8 +302,10 @@ def _pass(
 def after_code(
     name: str, value: ca.SX, m: ca.SX, code: LayerCode
 ) -> tuple[str, list[tuple[str, ca.SX]], list[int]]:
-    """A function ``{name}(by_v, through, slope)`` that adds to a Jacobian what goes through the layers; the derivatives
-    by products that it takes; the rows that it adds to.
+    """Write a function ``{name}(by_v, through, slope)`` that adds the effect of the layers to a Jacobian.
+
+    Returns:
+        The function, the derivatives with respect to products that it reads, and the rows that it changes.
     """
     texts, steps, rows = [], [], set[int]()
     outs: list[tuple[str, ca.SX]] = []

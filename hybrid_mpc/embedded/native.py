@@ -1,4 +1,4 @@
-"""The generated C behind the interface of the Python controller: compiled once, cached, called through ctypes."""
+"""The generated C with the interface of the Python controller: compiled once, cached, and called with ctypes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from nn_export.codegen import compile_library
 
 Array = NDArray[np.float64]
 FLAGS = ("-std=c11", "-O3", "-march=native", "-ffp-contract=off")
-"""Binds the library to this processor; a fused multiply-add would give other bits than the generated C elsewhere."""
+"""Options of the compiler. -march=native binds the library to this processor. Without -ffp-contract=off, a fused
+multiply-add would give other rounding errors than the generated C on other processors."""
 STATUS = (Status.INITIAL, Status.SOLVED, Status.NOT_FINITE, Status.INFEASIBLE, Status.INACCURATE)
 _BRIDGE = """
 #include "hmpc.h"
@@ -35,7 +36,7 @@ const size_t hmpc_places[] = {
   PLACE(steady.y), PLACE(steady.reached), PLACE(steady.steady), PLACE(plan.given_way)
 };
 """
-"""What the state's fields are found by."""
+"""C that exports the offsets of the state's fields."""
 FIELDS = (
     "x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect", "u", "status", "source", "age",
     "iterations", "steady_x", "steady_h", "steady_u", "steady_y", "reached", "steady", "given_way",
@@ -55,7 +56,7 @@ class Goal(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Prepared:
-    """What :meth:`NativeController.prepare` was given; ``ticket`` says whether the C state still holds its result."""
+    """Arguments of :meth:`NativeController.prepare`; ``ticket`` shows whether the C state still holds its result."""
 
     previous: Solution
     weight: Array | None
@@ -64,19 +65,18 @@ class Prepared:
 
 
 class NativeController(SplitController):
-    """The real-time iteration as compiled C: :class:`~hybrid_mpc.control.rti.CondensedController` in every respect but
-    time.
+    """The real-time iteration as compiled C, with the results of :class:`~hybrid_mpc.control.rti.CondensedController`.
 
-    The library is compiled when the object is made, unless the cache folder has it. Not for several threads at once.
+    The constructor compiles the library unless the cache folder holds it. Not thread-safe.
 
     Args:
         model: The deployed model.
-        ocp: The problem.
+        ocp: The control problem.
         flags: Options of the compiler. Default: :data:`FLAGS`.
 
     Raises:
-        InputError: If something of the two has no C, by name.
-        CompileError: If there is no compiler, or it fails.
+        InputError: If a part of model or problem cannot be exported as C.
+        CompileError: If there is no compiler, or the compilation fails.
     """
 
     converges = False
@@ -103,14 +103,14 @@ class NativeController(SplitController):
         w: Array | None = None,
     ) -> Solution:  # fmt: skip
         """See :meth:`~hybrid_mpc.control.rti.CondensedController.feedback`."""
-        if prepared.ticket != self._ticket:  # it has prepared something else since
+        if prepared.ticket != self._ticket:  # the C state holds another preparation
             prepared = self.prepare(prepared.previous, prepared.weight)
         start = perf_counter()
         self._ticket += 1
         view, m, problem = self._state.view, self.model, self.problem
         rows = np.ascontiguousarray(np.asarray(reference, dtype=np.float64))
         if rows.ndim != 2 or len(rows) < 1 or rows.shape[1] != self.ocp.columns:
-            problem.target(reference)  # says what is wrong
+            problem.target(reference)  # raises the InputError that explains the wrong shape
         columns = self.ocp.columns - self.ocp.n_p
         followed, p = np.ascontiguousarray(rows[:, :columns]), np.ascontiguousarray(rows[:, columns:])
         x, y = (None, followed) if self.ocp.n_y else (followed, None)
@@ -152,7 +152,7 @@ class NativeController(SplitController):
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
         *, limits: Limits | None = None, w: Array | None = None,
     ) -> Solution:  # fmt: skip
-        """:meth:`prepare` and :meth:`finish`."""
+        """Call :meth:`prepare`, then :meth:`finish`."""
         return self.finish(self.prepare(previous, weight), estimate, reference, limits, w)
 
     def _load(self, plan: Solution) -> None:
@@ -170,7 +170,7 @@ class NativeController(SplitController):
             view["steady_x"][:], view["steady_h"][:], view["steady_u"][:] = steady.x, steady.h, steady.u
 
     def _given_way(self) -> dict[str, float]:
-        """Largest violation of each hard bound that the plan exceeds, by name."""
+        """Largest violation of each relaxed hard bound, by name."""
         found: dict[str, float] = {}
         for name, value in zip(self._names, self._state.view["given_way"].tolist(), strict=False):
             if name and value > 0:
@@ -178,7 +178,7 @@ class NativeController(SplitController):
         return found
 
     def _steady(self) -> Steady | None:
-        """The steady state that the last solve found for the first row of an outputs' reference."""
+        """Steady state of the last solve for the first row of the outputs' reference; None without such a reference."""
         if not self.ocp.n_y:
             return None
         x, h, u, y = (self._state.view[f"steady_{name}"].copy() for name in "xhuy")
@@ -189,7 +189,7 @@ def goal_of(
     x: Array | None = None, weight: Array | None = None, u_min: Array | None = None, u_max: Array | None = None,
     *, y: Array | None = None, p: Array | None = None, w: Array | None = None,
 ) -> Goal:  # fmt: skip
-    """What a plan is to follow; the arrays, row by row, must outlive it."""
+    """Fill a ``hmpc_goal``; the arrays (row-major) must outlive it."""
 
     def at(array: Array | None) -> int | None:
         return None if array is None else array.ctypes.data
@@ -201,7 +201,7 @@ def goal_of(
 
 @dataclass(frozen=True)
 class Library:
-    """A loaded library, its sizes, and the places of the state's fields [bytes], the state's size first."""
+    """A loaded library, its sizes, and the size of the state and offsets of its fields [bytes]."""
 
     c: Any
     sizes: Mapping[str, int]
@@ -209,7 +209,7 @@ class Library:
 
 
 class State:
-    """A ``hmpc_state`` of doubles, cleared; ``at`` is its address, ``view`` has arrays on some of its fields."""
+    """A cleared ``hmpc_state`` in double precision; ``at`` is its address, ``view`` holds arrays on some fields."""
 
     def __init__(self, library: Library) -> None:
         n = library.sizes
@@ -234,7 +234,7 @@ class State:
 
 
 def load_library(sources: Sources, flags: Sequence[str] = FLAGS) -> Library:
-    """The C compiled, or the cached library, loaded."""
+    """Compile the C, unless the cache holds the library, and load the library."""
     path = compile_library(one_file(sources.texts), flags)
     c = ctypes.CDLL(str(path))
     state, pointer = ctypes.c_void_p, ctypes.c_void_p
@@ -255,7 +255,7 @@ def load_library(sources: Sources, flags: Sequence[str] = FLAGS) -> Library:
 
 
 def one_file(texts: Mapping[str, str]) -> str:
-    """All sources as one text, headers once and in place."""
+    """Join all sources to one text; each header is inserted once."""
     own = {name: template(name) for name in ("hmpc.h", "hmpc_math.h", *SOURCES)} | dict(texts)
     seen: set[str] = set()
 
@@ -265,7 +265,7 @@ def one_file(texts: Mapping[str, str]) -> str:
             name = line.split('"')[1] if line.startswith('#include "') else ""
             if not name:
                 lines.append(line)
-            elif name in own and name not in seen:  # a backup's are another controller's: none is in one file
+            elif name in own and name not in seen:  # the backup's headers are not among them
                 seen.add(name)
                 lines.append(written(own[name]))
         return "\n".join(lines)

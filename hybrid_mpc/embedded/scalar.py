@@ -1,4 +1,4 @@
-"""Scalar expressions of CasADi as C statements, and numbers as C tables."""
+"""C statements of CasADi's scalar expressions, and C tables of numbers."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from hybrid_mpc.errors import InputError
 
 MOST = 30_000
-"""Operations of an expression beyond which it is no scalar code any more."""
+"""Maximum operations of an expression that is exported as scalar code."""
 SMALL = 32
-"""Entries of a constant matrix up to which its product is scalar code; larger ones are layers of a network."""
+"""Maximum entries of a constant matrix whose product is scalar code; products with larger matrices are layers."""
 _BINARY = {
     ca.OP_ADD: "{} + {}", ca.OP_SUB: "{} - {}", ca.OP_MUL: "{} * {}", ca.OP_DIV: "{} / {}",
     ca.OP_FMIN: "hmpc_min({}, {})", ca.OP_FMAX: "hmpc_max({}, {})",
@@ -35,12 +35,12 @@ _LIBM = {
     ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder", ca.OP_COPYSIGN: "copysign", ca.OP_LOG1P: "log1p",
     ca.OP_EXPM1: "expm1",
 }  # fmt: skip
-"""Functions that come from the C library, whose last bits differ from one to the next."""
+"""Functions of the C library; their last bits differ between libraries."""
 _NAMES = {code: name for name, code in vars(ca).items() if name.startswith("OP_")}
 
 
 def number(value: float) -> str:
-    """A number as C.
+    """Write a number as C.
 
     Example:
         >>> number(0.5), number(float("-inf"))
@@ -52,10 +52,10 @@ def number(value: float) -> str:
 
 
 def comment(text: str) -> str:
-    """A text of anybody's as it may stand in a C comment: one line, that neither closes it nor goes on with the next.
+    """Escape a user's text for a C comment of one line.
 
-    Everything but letters, digits, blanks and ``_ . , : ; = + < > ( ) [ ]`` and ``-`` becomes ``_``: no ``*/``, no
-    backslash at a line's end, and no ``?`` that begins a trigraph.
+    All characters except letters, digits, blanks and ``_ . , : ; = + < > ( ) [ ] -`` become ``_``: no ``*/`` closes the
+    comment, no backslash continues the line, and no ``?`` begins a trigraph.
 
     Example:
         >>> comment("level [0]"), comment("x */ system(1); //")
@@ -65,7 +65,7 @@ def comment(text: str) -> str:
 
 
 def table(name: str, values: ArrayLike, kind: str = "real") -> str:
-    """A constant array of one or two axes; an empty axis has one element, since C has no empty arrays."""
+    """Write a constant array of one or two axes; an empty axis has one element, because C has no empty arrays."""
     array = np.asarray(values)
     full = np.zeros([max(1, n) for n in array.shape])
     full[tuple(slice(n) for n in array.shape)] = array
@@ -80,17 +80,17 @@ def c_function(
     name: str, arguments: Sequence[str], inputs: Mapping[str, ca.SX], results: Sequence[tuple[str, ca.SX]],
     before: Sequence[str] = (),
 ) -> tuple[str, int]:  # fmt: skip
-    """A C function of scalar statements, and how many operations it has.
+    """Write a C function of scalar statements; return the text and its number of operations.
 
     Args:
-        name: Its name.
-        arguments: Its parameters, e.g. ``"const real *x"``.
-        inputs: What CasADi's symbols are in C: ``{"x": symbol}`` for ``x[0], x[1], ...``.
-        results: Where each scalar expression goes, e.g. ``("y[0]", expression)``.
-        before: Statements before the first one.
+        name: Name of the function.
+        arguments: Parameters of the function, e.g. ``"const real *x"``.
+        inputs: CasADi's symbols by their name in C: ``{"x": symbol}`` for ``x[0], x[1], ...``.
+        results: Target of each scalar expression, e.g. ``("y[0]", expression)``.
+        before: Statements before the first one. Default: none.
 
     Raises:
-        InputError: If an operation has no C, or there are too many.
+        InputError: If an operation cannot be written as C, or there are too many operations.
 
     Example:
         >>> x = ca.SX.sym("x", 2)

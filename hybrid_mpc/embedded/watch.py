@@ -1,4 +1,4 @@
-"""C of a monitor and of a guard: their sizes, tables and scalar code."""
+"""Generated C of a monitor and of a guard: sizes, tables and scalar code."""
 
 from __future__ import annotations
 
@@ -26,13 +26,19 @@ from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
 KINDS = {EnergyReadings: 1, ResidualReadings: 2}
-"""What ``HMPC_MONITOR`` says."""
+"""Values of ``HMPC_MONITOR``."""
 
 
 @dataclass(frozen=True)
 class Watched:
-    """What a monitor adds to the generated files: whole numbers and real ones of the configuration, tables, code by
-    function and its operations.
+    """Parts of the generated files that belong to a monitor.
+
+    Args:
+        sizes: Integers of the configuration.
+        numbers: Real numbers of the configuration.
+        tables: Tables.
+        code: Scalar code.
+        operations: Operations of that code by function.
     """
 
     sizes: Mapping[str, int]
@@ -46,27 +52,29 @@ NOTHING = Watched({"MONITOR": 0, "RATES": 0}, {}, "", "", {})
 
 
 def refused_monitor(monitor: object, model: HybridModel) -> list[str]:
-    """What of a monitor has no C, in words."""
+    """Texts about the parts of a monitor that cannot be exported as C."""
     if type(monitor) is not Monitor or type(monitor.readings) not in KINDS:
         return [f"a monitor of another kind than Monitor ({type(monitor).__name__})"]
     found = []
     if not _alike(monitor.model, model):
-        found.append(f"a monitor of another model ({monitor.model.name}) than the one that plans")
+        found.append(
+            f"a monitor of another model ({monitor.model.name}) than the controller's ({model.name})"
+        )
     return found
 
 
 def refused_guard(
     guard: Guard, monitored: bool, model: HybridModel, ocp: OCP, safe_input: Array | None
 ) -> list[str]:
-    """What of a guard has no C, but for its backup's own; in words."""
-    found = [] if monitored else ["a guard without a monitor, on whose alarms it acts"]
+    """Texts about the parts of a guard that cannot be exported as C, without those inside its backup."""
+    found = [] if monitored else ["a guard without a monitor: a guard reacts to the monitor's alarms"]
     if Mode.REST in (guard.on_model, guard.on_sensor) and safe_input is None:
         found.append("a guard's mode REST without a safe input")
     if guard.backup is None:
         return found
     backup = guard.backup.controller
     if not solves_once(guard.backup):
-        found.append(f"a backup by another solver than rti with one iteration ({type(backup).__name__})")
+        found.append(f"a backup with another solver than rti with one iteration ({type(backup).__name__})")
     sizes = [(m.n_x, m.n_u, m.n_y, m.n_w, m.dt) for m in (backup.model, model)]
     shapes = [(o.horizon, o.columns, o.n_y, o.n_p) for o in (backup.ocp, ocp)]
     if sizes[0] != sizes[1] or shapes[0] != shapes[1]:
@@ -75,16 +83,16 @@ def refused_guard(
 
 
 def solves_once(safe: SafeController) -> bool:
-    """Whether a controller is the real-time iteration with one iteration a period, in Python or as C."""
+    """Whether a controller is the real-time iteration with one iteration in each period, in Python or as C."""
     controller = safe.controller
     return not controller.converges and getattr(controller, "iterations", 1) == 1
 
 
 def monitor_parts(monitor: Monitor | None, model: HybridModel, parts: Cut) -> Watched:
-    """What a monitor adds; ``parts`` is the model's step cut at its cell.
+    """Generate the parts of a monitor; ``parts`` is the model's step, cut at its GRU cell.
 
     Raises:
-        InputError: If an expression of it has no C.
+        InputError: If an expression of the monitor cannot be written as C.
     """
     if monitor is None:
         return NOTHING
@@ -124,7 +132,7 @@ def monitor_parts(monitor: Monitor | None, model: HybridModel, parts: Cut) -> Wa
 
 
 def guard_parts(guard: Guard | None, model: HybridModel) -> tuple[dict[str, int], str]:
-    """Sizes and tables of a guard; its times in periods."""
+    """Generate sizes and tables of a guard; times are in periods."""
     if guard is None:
         return {"GUARD": 0, "BACKUP": 0}, ""
     times = {
@@ -140,7 +148,7 @@ def guard_parts(guard: Guard | None, model: HybridModel) -> tuple[dict[str, int]
 
 
 def periods_of(seconds: float, dt: float) -> int:
-    """The least number of periods that last so long, but for the tolerance with which a guard compares times.
+    """Smallest number of periods that is not shorter than a duration, within the guard's tolerance for times.
 
     Example:
         >>> periods_of(0.5, 0.02), periods_of(0.0, 0.02), periods_of(0.5, 0.3)
@@ -150,7 +158,7 @@ def periods_of(seconds: float, dt: float) -> int:
 
 
 def _alike(own: HybridModel, other: HybridModel) -> bool:
-    """Whether two models take the same steps."""
+    """Whether two models have the same sizes and the same steps (at three random points)."""
     if own is other:
         return True
     sizes = [(m.n_x, m.n_h, m.n_u, m.n_w, m.n_y, m.dt, m.nominal_w) for m in (own, other)]
@@ -221,9 +229,9 @@ def _energy(readings: EnergyReadings, model: HybridModel, parts: Cut) -> Watched
 
 
 def _rates(model: HybridModel, parts: Cut) -> tuple[str, dict[str, int], dict[str, int]]:
-    """Code of the model's rates, by the step's own cell where they have it; sizes and operations."""
+    """Code, sizes and operations of the model's rates; they share the GRU cell with the step if it is the same cell."""
     own = cut(model, "xdot")
-    if own.cell is not None and not own.cell.same(parts.cell):  # the step has none of this kind
+    if own.cell is not None and not own.cell.same(parts.cell):  # the step has no such cell
         own = cut(model, "xdot", layered=True)
     z, u, w = (
         ca.SX.sym(name, n) for name, n in (("z", model.n_x + model.n_h), ("u", model.n_u), ("w", model.n_w))

@@ -1,8 +1,8 @@
-"""Bands around free runs: how far a model may be off, from what is known of its uncertainty, calibrated once.
+"""Prediction bands around free runs, calibrated on validation runs.
 
-The variance of an error is a sum of parts: the sensor's noise, the scatter between networks, what the covariance of the
-fitted parameters makes of the outputs, and a growth with the time since the start. How much each part counts is found
-by maximum likelihood on validation runs; then all widths are scaled so that the share asked for lies inside.
+The variance of an error is a weighted sum of four parts: the sensor's noise, the variance between the networks, the
+variance due to the covariance of the fitted parameters, and a part that grows with the time since the start. The
+weights maximize the likelihood of validation runs. Then all widths are scaled so that the band holds the nominal share.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ Array = NDArray[np.float64]
 Pair: TypeAlias = tuple[Array, Array]
 """Errors of an output in a run ``(n,)``, and the parts of their variance ``(n, m)``."""
 KNOWN = 8
-"""Independent errors that the validation runs count for at least; more runs count one each."""
+"""Minimum number of independent errors that the validation runs stand for; beyond it, each run counts as one."""
 LEAST = 1e-6
-"""Least weight of the noise: a variance is never zero."""
+"""Minimum of a variance over the mean square, so that it is never zero."""
 FOLDS = 5
-"""Groups of validation runs, each left out once, that decide whether a band's width varies."""
+"""Groups of validation runs of the cross-validation that decides whether a band's width varies."""
 FAR = 1e3
-"""Spreads of an output beyond which a part of an error's variance says no more."""
+"""Limit of a part's standard deviation, in spreads of the output."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,13 @@ def variance_parts(
     """Parts of the variance of a free run's errors ``(n, n_y, 4)`` [output units^2].
 
     Args:
-        t: Time since the start ``(n,)`` [s]; the growth is one at the run's end.
-        sigma: Noise of the sensors ``(n_y,)`` [output units].
+        t: Time since the start ``(n,)`` [s].
+        sigma: Standard deviation of the sensors' noise ``(n_y,)`` [output units].
         spread: Spread of the outputs ``(n_y,)`` [output units].
         networks: Variance between the networks ``(n, n_y)`` [output units^2]; zero for the prior.
-        parameters: Variance by the covariance of the fitted parameters ``(n, n_y)`` [output units^2].
-        longest: Length [s] at which the growth is one and beyond which it goes on, in a longer run. Default: its own.
+        parameters: Variance due to the covariance of the fitted parameters ``(n, n_y)`` [output units^2].
+        longest: Time [s] at which the growing part equals the squared spread; it grows further in a longer run.
+            Default: the length of the run.
     """
     n, n_y = networks.shape
     growth = (np.asarray(t) / max(min(float(np.max(t)), longest), 1e-300))[:, None] * np.square(spread)
@@ -84,16 +85,16 @@ def run_variance(
     """Parts of the variance of a free run's errors ``(n, n_y, 4)``, from the runs of all networks.
 
     Args:
-        outputs: Outputs of the runs of all networks ``(m, n, n_y)``; of the prior a single one.
-        parameters: Variance by that of the fitted parameters ``(n, n_y)``, see
+        outputs: Outputs of the runs of all networks ``(m, n, n_y)``; a single run for the prior.
+        parameters: Variance due to the covariance of the fitted parameters ``(n, n_y)``, see
             :func:`~hybrid_mpc.identify.fit.parameter_variance`.
         t: Time since the start ``(n,)`` [s].
-        sigma: Noise of the sensors ``(n_y,)``.
+        sigma: Standard deviation of the sensors' noise ``(n_y,)``.
         spread: Spread of the outputs ``(n_y,)``.
-        longest: As :func:`variance_parts` has it.
+        longest: As in :func:`variance_parts`.
     """
     limit = np.square(FAR * spread)
-    with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges has a band without end
+    with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite variance
         networks = np.nan_to_num(outputs.var(axis=0), nan=np.inf)
     return variance_parts(
         t, sigma, spread, np.minimum(networks, limit), np.minimum(parameters, limit), longest=longest
@@ -101,15 +102,15 @@ def run_variance(
 
 
 def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:
-    """Bands that hold a share of the measurements of validation runs.
+    """Calibrate bands that hold a share of the measurements of validation runs.
 
-    The scale is a quantile of the errors over their standard deviation (split conformal prediction), taken with equal
-    weight of every run. Errors within a run hang together: a few runs tell their variance as badly as ``KNOWN`` errors
-    would. So the scale is larger by the ratio of Student's quantile to the normal one. An output's width varies only if
-    that scores better (:func:`interval_score`) on validation runs that its weights were not found on.
+    The scale is a quantile of the errors over their standard deviation (split conformal prediction), with equal weight
+    of every run. Errors within a run are correlated, so a few runs estimate the quantile poorly: the scale is increased
+    by the ratio of Student's quantile to the normal one. An output's width varies only if varying widths have a better
+    :func:`interval_score` in a cross-validation; else it is constant.
 
     Raises:
-        InputError: If there is no run, or the share is none.
+        InputError: If there is no run, or the share is not between 0 and 1.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -134,7 +135,7 @@ def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:
         seen = [np.isfinite(run.error[:, j]) for run in runs]
         pairs = [(run.error[s, j], run.parts[s, j]) for run, s in zip(runs, seen, strict=True) if np.any(s)]
         flat = np.eye(runs[0].parts.shape[2])[0]
-        if not pairs:  # never measured in these runs: as wide as the sensor's noise
+        if not pairs:  # never measured in these runs: the band of the sensor's noise
             weights.append(tuple(flat.tolist()))
             scale.append(float(norm.ppf(0.5 * (1 + share))))
             constant.append(scale[-1])
@@ -153,9 +154,9 @@ def coverage(run: RunParts, bands: Bands) -> float:
 
 
 def interval_score(run: RunParts, bands: Bands) -> Array:
-    """Mean interval score of a run's band, by output ``(n_y,)`` [output units]; the less the better.
+    """Mean interval score of a run's band, by output ``(n_y,)`` [output units]; lower is better.
 
-    The band's width, and for a measurement outside of it its distance, ``2 / (1 - share)`` times.
+    The score is the width of the band, plus ``2 / (1 - share)`` times the distance of a measurement outside the band.
 
     Source: Gneiting and Raftery, *Strictly proper scoring rules, prediction, and estimation*, JASA 102 (2007).
     """
@@ -165,7 +166,7 @@ def interval_score(run: RunParts, bands: Bands) -> Array:
 
 
 def _width_that_varies_is_better(pairs: Sequence[Pair], flat: Array, share: float) -> bool:
-    """Whether bands whose weights were found on other runs score better than those of a constant width."""
+    """Whether bands of varying width score better in a cross-validation than bands of constant width."""
     folds, score = [pairs[k::FOLDS] for k in range(min(FOLDS, len(pairs)))], np.zeros(2)
     for k, them in enumerate(folds):
         others = [pair for i, fold in enumerate(folds) if i != k for pair in fold]
@@ -185,14 +186,14 @@ def _deviations(parts: Array, weights: Array) -> Array:
 
 
 def _scale(pairs: Sequence[Pair], weights: Array, share: float) -> float:
-    """By what standard deviations are to be multiplied to hold the share."""
+    """Factor on the standard deviations so that the band holds the share."""
     ratios = np.concatenate([np.abs(error) / _deviations(parts, weights) for error, parts in pairs])
     each = np.concatenate([np.full(len(error), 1.0 / len(error)) for error, _ in pairs])
     return _quantile(ratios, each, share, len(pairs))
 
 
 def _weights(pairs: Sequence[Pair]) -> Array:
-    """Weights of the parts that make the errors of runs most likely, if they were normal."""
+    """Weights of the parts that maximize the normal likelihood of the runs' errors: minimum of log(v) + e^2 / v."""
     error, parts = (np.concatenate(v) for v in zip(*pairs, strict=True))
     size = np.maximum(parts.mean(axis=0), 1e-300)
     known = parts.max(axis=0) > 0
@@ -212,7 +213,7 @@ def _weights(pairs: Sequence[Pair]) -> Array:
 
 
 def _quantile(ratios: Array, weights: Array, share: float, runs: int) -> float:
-    """Weighted quantile, widened for what so few runs do not tell."""
+    """Weighted quantile, increased for the small number of runs."""
     order, tail = np.argsort(ratios), 0.5 * (1 + share)
     total = np.cumsum(weights[order]) / float(weights.sum())
     own = float(ratios[order][min(int(np.searchsorted(total, share)), len(order) - 1)])

@@ -1,7 +1,7 @@
-"""Do no harm: which of the candidates is recommended, by free runs over data that were left out.
+"""Choice of the recommended model among fitted prior and hybrids, by free runs over held-out data.
 
-A hybrid is recommended only if it beats the fitted prior there by more than the uncertainty of the comparison. Where
-the whole correction does not, a share of it may.
+A hybrid is recommended only if its error is significantly smaller than the fitted prior's. If the full correction of
+the networks is not significantly better, a share of it is tried.
 """
 
 from __future__ import annotations
@@ -20,34 +20,37 @@ from hybrid_mpc.errors import InputError
 
 Array = NDArray[np.float64]
 BLOCKS = 8
-"""Blocks at least that runs of few recordings are cut into: the scatter between fewer says little."""
+"""Minimum number of blocks that runs of few recordings are cut into; fewer blocks estimate the scatter poorly."""
 RECORDINGS = 2
-"""Recordings from which on each of them is a block: errors within one hang together, and the next may be of another
-day."""
+"""Number of recordings from which on each recording is one block: errors within a recording are correlated, and
+recordings can differ from day to day."""
 FEWEST = 3
-"""Recordings that give a bound, where each of them is a block: of two a single difference would tell their scatter, and
-on the temperature lab two that agreed by chance made a hybrid recommended that was 1.3 to 1.4 times worse."""
+"""Minimum number of recordings for an upper bound, if each recording is a block. Two recordings give one difference,
+which estimates the scatter poorly: on the temperature lab, two recordings agreed by chance, and a hybrid with 1.3 to
+1.4 times the prior's error was recommended."""
 CONFIDENCE = 0.95
-"""Probability, one-sided, with which a bound holds; each share of each kind has its own. With one kind of which half is
-exactly as good as the prior, and all else is worse, 6 % of choices take it (``tests/identify/test_choose.py``)."""
+"""Confidence level, one-sided, of each upper bound; each share of each kind has its own bound. If half a correction is
+exactly as good as the prior and all others are worse, 6 % of the choices recommend a hybrid
+(``tests/identify/test_choose.py``)."""
 SHARES = (0.75, 0.5)
-"""Shares of a correction that are tried, the largest first, where the whole of it does not surely beat the prior. The
-errors of prior and hybrid are alike only in part: a model between them may err less than either, and scatters less, so
-half a correction may be sure where the whole is not. A quarter is not tried: it alone was sure in 3 of 45 cells
-on real machines, and had 0.99, 1.05, 1.01 of the prior's error there (docs/results/no_harm.md)."""
+"""Shares of a correction that are tried, the largest first, if the full correction is not significantly better than the
+prior. The errors of prior and hybrid are only partly correlated, so a model between them can have a smaller error and
+less scatter than both. Then half a correction can be significant although the full one is not. A quarter is not tried:
+it alone was significant in 3 of 45 cells on real machines, with 0.99, 1.05 and 1.01 times the prior's error
+(docs/results/no_harm.md)."""
 CONFIDENT = 1.0
-"""Ratio to the prior's error that the upper bound of the hybrid's has to stay below."""
+"""The upper bound of a hybrid's error over the prior's must be below this ratio."""
 
 
 @dataclass(frozen=True)
 class CandidateFigures:
-    """A candidate on the runs that it is judged by: over data that were left out.
+    """Errors of a candidate in free runs over held-out data.
 
     Args:
         error: Root mean square of the outputs' errors, each over its spread [-]; infinite if a run diverged.
-        ratio: That over the prior's [-]; of several recordings the geometric mean of each one's.
-        upper: Upper bound of the ratio with a probability of ``CONFIDENCE`` [-].
-        share: Share of the networks' correction that it has. Default: the whole.
+        ratio: Error over the prior's [-]; for several recordings the geometric mean of their ratios.
+        upper: Upper bound of the ratio at the confidence level ``CONFIDENCE`` [-].
+        share: Share of the networks' correction in the candidate. Default: the full correction.
     """
 
     error: float
@@ -58,15 +61,15 @@ class CandidateFigures:
 
 @dataclass(frozen=True)
 class Choice:
-    """Which model is recommended and why.
+    """The recommended model and the reason.
 
     Args:
-        recommended: Name of the candidate.
-        hybrid: The hybrid that is exported: the recommended one, else that with the least error.
+        recommended: Name of the recommended candidate.
+        hybrid: The hybrid that is exported: the recommended one, else the one with the least error.
         candidates: Figures by candidate.
         reason: One sentence for the report.
-        blocks: Blocks of these runs that were compared.
-        sure: The hybrids that surely beat the prior.
+        blocks: Number of recordings or blocks that were compared.
+        sure: The hybrids that are significantly better than the prior.
     """
 
     recommended: str
@@ -77,7 +80,7 @@ class Choice:
     sure: tuple[str, ...] = ()
 
     def share(self, name: str) -> float:
-        """Share of the networks' correction that a kind has in the model; of what is no candidate the whole."""
+        """Share of the networks' correction in a model; 1 for a model that is not a candidate."""
         return self.candidates[name].share if name in self.candidates else 1.0
 
 
@@ -91,29 +94,31 @@ def recommend(
     evidence: str = "recordings",
     shrunk: Callable[[str, float], Sequence[Array]] | None = None,
 ) -> Choice:
-    """Choose among the prior and hybrids, by their squared errors over the same runs, which no hybrid was trained on.
+    """Choose among the prior and hybrids by their squared errors over the same held-out runs.
 
-    The ratio of a hybrid's error to the prior's is the geometric mean of each recording's where there are
-    ``RECORDINGS`` or more, and its bound is that of the mean of the logarithms: another recording may be like any of
-    these, so a single one in which the prior is far off does not outweigh the others. Over all runs together the hybrid
-    must be better as well. Of several hybrids that surely beat the prior the one with the lowest ratio is recommended.
-    Within a single recording the ratio is that of the root mean squares; its scatter is found by leaving out one block
-    after the other (jackknife); a block is a contiguous part of a run.
+    A hybrid is significantly better than the prior if the upper bound of its ratio is below 1 and its error over all
+    runs together is smaller too. Of several such hybrids, the one with the lowest ratio is recommended.
+
+    - ``RECORDINGS`` or more recordings: the ratio is the geometric mean over the recordings of the hybrid's error over
+      the prior's. Its bound is that of the mean of the logarithms (Student's t). So a single recording with a large
+      error of the prior does not dominate.
+    - A single recording: the ratio is that of the root mean squares. Its standard error is the jackknife's: one block
+      (a contiguous part of a run) after the other is left out.
 
     Args:
-        errors: For each candidate its squared errors of each run ``(n,)`` [-]: the mean over the outputs of the error
-            over its spread, squared.
-        prior: Name of the prior among them.
-        deploy: Candidate that the user wants whatever the figures say. Default: none.
-        samples: Samples of a block at least, within which errors hang together. Default: 1.
-        recordings: Which recording each run is from, or which part of a single one. Default: all are from one.
-        evidence: What these are called in the reason.
-        shrunk: ``(name, share) -> errors`` of a hybrid of which a share of its networks' correction counts. It is asked
-            where the whole does not surely beat the prior; the largest of ``SHARES`` that surely does is taken, else
-            the whole. Default: the whole alone.
+        errors: Squared errors of each run ``(n,)`` [-], by candidate: the mean over the outputs of the squared error
+            over the squared spread.
+        prior: Name of the prior in ``errors``.
+        deploy: Candidate to recommend whatever the figures are. Default: none.
+        samples: Minimum samples of a block; errors within a block are correlated. Default: 1.
+        recordings: Recording of each run, or part of a single recording. Default: all runs are of one recording.
+        evidence: Name of the recordings or parts in the reason.
+        shrunk: ``(name, share) -> errors`` of a hybrid with a share of its networks' correction. It is called if the
+            full correction is not significantly better than the prior. The largest of ``SHARES`` that is significantly
+            better is used, else the full correction. Default: only the full correction.
 
     Raises:
-        InputError: If ``deploy`` is no candidate, or there is no validation run.
+        InputError: If ``deploy`` is not a candidate, or there is no validation run.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -145,7 +150,7 @@ def recommend(
     hybrids = [name for name in errors if name != prior]
     best = min(hybrids, key=lambda name: figures[name].error, default=prior)
     safe = [name for name in hybrids if compared.sure(figures[name])]
-    # the lowest mean of the logarithms: what the next recording is expected to have; two that are alike by their error
+    # the lowest mean logarithm is the best expectation for the next recording; equal ratios are ordered by the error
     chosen = min(safe, key=lambda name: (figures[name].ratio, figures[name].error), default=prior)
     pieces = compared.pieces
     of_what = f"{evidence}, their geometric mean" if compared.whole else "block" if pieces == 1 else "blocks"
@@ -158,7 +163,7 @@ def recommend(
 
 
 class _Compared:
-    """Figures of candidates over the pieces of evidence that the prior's runs are cut into."""
+    """Comparison of candidates with the prior, over the recordings or blocks that the prior's runs are cut into."""
 
     def __init__(self, prior: Sequence[Array], samples: int, recordings: Sequence[str]) -> None:
         self._cuts = _cuts([len(run) for run in prior], samples)
@@ -172,11 +177,11 @@ class _Compared:
 
     @property
     def pieces(self) -> int:
-        """How many there are."""
+        """Number of recordings or blocks."""
         return len(set(self._of.tolist())) if self.whole else len(self._sizes)
 
     def figures(self, runs: Sequence[Array], share: float = 1.0) -> CandidateFigures:
-        """Of a candidate's squared errors by run."""
+        """Figures of a candidate from its squared errors by run."""
         own = _sums(runs, self._cuts)
         if np.array_equal(own, self._prior) and np.isfinite(own).all():
             return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share)
@@ -187,7 +192,7 @@ class _Compared:
         return replace(found, share=share)
 
     def sure(self, figures: CandidateFigures) -> bool:
-        """Whether they are surely better than the prior's, and better over all runs together."""
+        """Whether a candidate is significantly better than the prior, and also better over all runs together."""
         return figures.upper < CONFIDENT and figures.error < _root_mean(self._prior, self._sizes)
 
 
@@ -239,12 +244,15 @@ def _sums(runs: Sequence[Array], cuts: Sequence[Sequence[tuple[int, int]]]) -> A
 
 
 def _root_mean(sums: Array, sizes: Array) -> float:
-    """Root mean square of what the sums of squares of blocks are of; infinite where a run diverged."""
+    """Root mean square from the sums of squares and the sizes of blocks; infinite if a run diverged."""
     return math.sqrt(float(sums.sum()) / float(sizes.sum())) if np.isfinite(sums).all() else math.inf
 
 
 def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
-    """Figures from the sums of squares of blocks; the scatter is the jackknife's."""
+    """Figures from the sums of squares of blocks, with the jackknife's standard error.
+
+    With l_i the logarithm of the ratio without block i: s^2 = (n - 1) / n sum (l_i - mean(l))^2 (Efron, 1982).
+    """
     n = len(sizes)
     error = _root_mean(own, sizes)
     if not math.isfinite(error):
@@ -261,11 +269,14 @@ def _by_blocks(own: Array, prior: Array, sizes: Array) -> CandidateFigures:
 
 
 def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures) -> CandidateFigures:
-    """Figures from the sums of squares of recordings: the mean of the logarithms of their ratios."""
+    """Figures from the sums of squares of recordings.
+
+    With l_i = log(ratio of recording i): upper = exp(mean(l) + t_{n-1, CONFIDENCE} std(l) / sqrt(n)).
+    """
     if not np.isfinite(own).all() or not np.isfinite(prior).all():
         return blocks
     n, each = len(own), 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
-    most = math.inf  # two may agree by chance
+    most = math.inf  # no bound from two recordings: they may agree by chance
     if n >= FEWEST:
         most = float(each.mean() + student.ppf(CONFIDENCE, n - 1) * each.std(ddof=1) / math.sqrt(n))
     return CandidateFigures(

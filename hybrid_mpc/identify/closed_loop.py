@@ -30,29 +30,29 @@ from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 PREDICTION_STEPS = 12
-"""Gauss-Newton steps of a fit of predictions at most; it starts near its end."""
+"""Maximum Gauss-Newton steps of a fit of predictions, which starts near the optimum."""
 GAIN = 1e3
-"""Largest element of an observer's gain [sizes of a state a spread of an output]."""
+"""Bound of an element of the observer's gain [sizes of a state per spread of an output]."""
 QUIETLY = 0.01
-"""Least noise of sensors and states that an observer's first gain counts with, over their spread and their size."""
+"""Minimum noise of sensors and states for the observer's initial gain, over their spread and their size."""
 PAST, ANSWERS = 10, 3
-"""Samples of an input's own past, and of prediction errors, that are asked for feedback."""
+"""Samples of an input's own past, and of prediction errors, in the test for feedback."""
 MEMORY = 200
-"""Lags up to which series are asked how far they hang together."""
+"""Largest lag of the autocorrelations."""
 CHANCE = 4.0
-"""Standard deviations of a correlation by chance that count as 1: of some dozen, one in a thousand is larger."""
+"""Standard deviations of a chance correlation that give the value 1: one of some dozen correlations exceeds it with a
+probability of 0.1 %."""
 
 
 class PredictionFit(OutputFit):
-    """The same parameters beside the gain of an observer: predictions one period ahead instead of free runs.
+    """Fit of one-step predictions with an observer, instead of free runs.
 
-    ``z+ = f(z + K (y - g(x, u)), u)`` with ``z = (x, d)``, of which ``d`` are the unknown rates of the states that the
-    prior has corrected; ``theta`` has ``K`` ``(n_z, n_y)`` behind the parameters. The delay stays: inputs are those
-    that act.
+    ``z+ = f(z + K (y - g(x, u)), u)`` with ``z = (x, d)``; ``d`` are unknown rates of the corrected states. ``theta``
+    holds the parameters, then ``K`` ``(n_z, n_y)``. The delay is not fitted: the inputs are those that act.
 
     Args:
         fit: The fit of free runs.
-        smoother: Of a fitted prior. Its filter at rest has the first ``K``.
+        smoother: Smoother of the fitted prior. The gain of its filter at rest is the initial ``K``.
     """
 
     def __init__(self, fit: OutputFit, smoother: Smoother) -> None:
@@ -72,11 +72,11 @@ class PredictionFit(OutputFit):
 
     @property
     def names(self) -> list[str]:
-        """Names of what is fitted."""
+        """Names of the fitted parameters and gains."""
         return [*super().names, *self._gains]
 
     def of(self, windows: OutputWindows) -> OutputWindows:
-        """Windows with first states ``z``, of which ``d`` begins at zero."""
+        """Windows with initial states ``z``; ``d`` starts at zero."""
         more = np.zeros((len(windows.x), len(self._corrected)))
         known = np.concatenate([windows.known, more > 0], axis=1)
         return replace(windows, x=np.concatenate([windows.x, more], axis=1), known=known)
@@ -107,7 +107,7 @@ def _observed(
 ) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Rates and outputs of ``z``, and ``z`` corrected by a measurement, as functions ``(z, u, w, p)``.
 
-    Inputs are ``[u, slope by the delay, y, whether it is there]``, parameters ``[p, change of the delay, K]``.
+    Inputs are ``[u, derivative by the delay, y, 1 or 0 for a missing y]``, parameters ``[p, change of the delay, K]``.
     """
     rates, late = delayed(with_unknown_rates(equations.xdot, corrected)), delayed(equations.output)
     n_y, n_z, n_x = late.size1_out(0), rates.size1_in(0), late.size1_in(0)
@@ -122,7 +122,7 @@ def _observed(
 
 
 def _gain_at_rest(smoother: Smoother, sizes: Array) -> Array:
-    """Gain ``(n_z, n_y)`` of a smoother's filter at rest; none where the outputs do not tell of all states there."""
+    """Gain ``(n_z, n_y)`` of a smoother's filter at rest; zero if not all states are observable there."""
     prior, n_x = smoother.prior, len(smoother.prior.states)
     x, u, w = rest_of(prior)
     z = np.concatenate([x, np.zeros(len(prior.corrected))])
@@ -138,22 +138,22 @@ def _gain_at_rest(smoother: Smoother, sizes: Array) -> Array:
     noise = np.diag(np.square(np.maximum(smoother.sigma / spread, QUIETLY)))
     try:
         p, _ = dare(a.T, c.T, np.diag(np.square(np.maximum(walk, QUIETLY * smoother.dt))), noise)
-    except InputError:  # the fit finds one by itself
+    except InputError:  # not observable at rest: the fit starts without a gain
         return np.zeros((len(z), len(spread)))
     return np.asarray(np.linalg.solve(c @ p @ c.T + noise, c @ p).T * np.outer(sizes, 1.0 / spread))
 
 
 def fit_by_prediction(fit: OutputFit, theta: Array, windows: OutputWindows, smoother: Smoother) -> Fitted:
-    """Fit ``theta`` to the errors of predictions one period ahead, with the gain of their observer; the delay stays.
+    """Fit ``theta`` and an observer's gain to one-step prediction errors; the delay is not fitted.
 
-    A machine that is unstable, or that was recorded under feedback with disturbances of its own, biases free runs:
-    inputs then answer to what free runs take for their error. Predictions know the measured past.
+    Recordings of an unstable machine, or in closed loop with disturbances, bias a fit of free runs: the inputs respond
+    to effects that a free run does not contain. One-step predictions use the measured past.
 
     Args:
         fit: The fit of free runs.
-        theta: What it found.
-        windows: Windows of the recordings with inputs that act.
-        smoother: That of the prior with ``theta``.
+        theta: Result of that fit.
+        windows: Windows of the recordings, with inputs that act.
+        smoother: Smoother of the prior with ``theta``.
 
     Source: Ljung, *System Identification: Theory for the User*, 1999, sections 4.3 and 7.3.
     """
@@ -175,14 +175,15 @@ class Driven(Protocol):
 
 
 def feedback(trajectories: Sequence[Driven], errors: Sequence[Array]) -> float:
-    """How far inputs answer to earlier prediction errors: the largest correlation, over what chance makes of it.
+    """Test for feedback: largest correlation of inputs with earlier prediction errors, over its chance level.
 
-    What an input's own past does not tell of it is compared with the prediction errors of the same sample and of those
-    before; it is zero, but for chance, if the recordings were made in open loop. Several times 1 is feedback.
+    The part of an input that its own past does not predict is correlated with the prediction errors of the same sample
+    and of the samples before. In open loop, this correlation is zero up to chance. A result well above 1 shows
+    feedback.
 
     Args:
         trajectories: Recordings.
-        errors: Prediction errors ``(n, n_y)`` of each, NaN where nothing was measured.
+        errors: Prediction errors ``(n, n_y)`` of each recording; NaN for a missing sample.
     """
     largest = 0.0
     for j in range(trajectories[0].u.shape[1]):
@@ -210,10 +211,10 @@ def feedback(trajectories: Sequence[Driven], errors: Sequence[Array]) -> float:
 
 
 def _memory(values: Array) -> Array:
-    """Correlations of a series with itself, at lags of up to ``MEMORY`` to either side.
+    """Autocorrelation of a series, at lags of up to ``MEMORY`` to either side.
 
-    The correlation of two independent series has the variance of the sum of the products of theirs, over their length
-    (Bartlett, *On the theoretical specification and sampling properties of autocorrelated time-series*, 1946).
+    The correlation of two independent series has the variance ``sum_k rho_1(k) rho_2(k) / n`` (Bartlett, *On the
+    theoretical specification and sampling properties of autocorrelated time-series*, 1946).
     """
     n = len(values)
     power = np.square(np.abs(np.fft.rfft(values, 2 * n)))
@@ -223,6 +224,6 @@ def _memory(values: Array) -> Array:
 
 
 def _without_jumps(values: Array) -> Array:
-    """Values within three robust standard deviations: the jumps of a reference hide the rest of an input."""
+    """Clip values to three robust standard deviations, because jumps of a reference dominate an input's correlation."""
     limit = OUTLIERS * 1.4826 * float(np.median(np.abs(values)))
     return np.clip(values, -limit, limit)

@@ -1,4 +1,4 @@
-"""Windows of trajectories as tensors: what fits and trainings take."""
+"""Windows of trajectories as tensors, for trainings."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 
 LONGEST = 1000
-"""Periods of a validation window at most: drifts show by then, and longer ones would take the training's time."""
+"""Maximum periods of a validation window: long enough to show drifts, and short enough for the training's time."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Equal windows cut from trajectories [SI]: a warm-up of ``warm`` samples on measurements, then a scored part.
+    """Windows of equal length, cut from trajectories [SI]: a warm-up on measurements, then an evaluated part.
 
-    States ``x`` are ``(n, warm + horizon + 1, n_x)``; inputs ``u``, disturbances ``w`` and the states' derivatives
-    ``xdot`` at the periods' starts ``(n, warm + horizon, ...)``. ``weight`` ``(networks, n)`` says how much a window
-    counts for each network; None: all alike.
+    Args:
+        x: States ``(n, warm + horizon + 1, n_x)``.
+        u: Inputs ``(n, warm + horizon, n_u)``.
+        w: Disturbances ``(n, warm + horizon, n_w)``.
+        warm: Samples of the warm-up.
+        xdot: Derivatives of the states at the start of each period ``(n, warm + horizon, n_x)``.
+        weight: Weight of each window for each network ``(networks, n)``. Default: equal weights.
     """
 
     x: Tensor
@@ -35,20 +39,20 @@ class Windows:
 
     @property
     def horizon(self) -> int:
-        """Scored periods of each window."""
+        """Evaluated periods of each window."""
         return self.u.shape[1] - self.warm
 
     def __len__(self) -> int:
         return self.x.shape[0]
 
     def take(self, index: Tensor) -> Windows:
-        """The windows of ``index``."""
+        """Select the windows of ``index``."""
         index = index.to(self.x.device)
         weight = None if self.weight is None else self.weight[:, index]
         return Windows(self.x[index], self.u[index], self.w[index], self.warm, self.xdot[index], weight)
 
     def to(self, device: torch.device) -> Windows:
-        """The same windows on a device."""
+        """Move the windows to a device."""
         weight = None if self.weight is None else self.weight.to(device)
         return Windows(
             self.x.to(device), self.u.to(device), self.w.to(device), self.warm, self.xdot.to(device), weight
@@ -62,9 +66,9 @@ def cut_windows(
     stride: int,
     weights: Sequence[Sequence[float]] = (),
 ) -> Windows:
-    """Windows of ``warm + horizon`` periods, every ``stride`` samples, from every trajectory long enough.
+    """Cut windows of ``warm + horizon`` periods, every ``stride`` samples, from all trajectories that are long enough.
 
-    ``weights`` has a row a trajectory: how much its windows count for each network. Default: all alike.
+    ``weights`` has a row for each trajectory: the weight of its windows for each network. Default: equal weights.
     """
     x, u, w, xdot, length = [], [], [], [], warm + horizon
     rows: list[Sequence[float]] = []
@@ -91,18 +95,18 @@ def cut_windows(
 def in_parts(
     trajectories: Sequence[Trajectory], parts: int, shortest: int
 ) -> tuple[list[Trajectory], list[int]]:
-    """Training data in parts of about the same length, of which a network may leave one out.
+    """Divide training data into parts of about the same length; each network leaves one part out.
 
-    A part is whole recordings, where there are as many of them as parts. Else every recording is cut into equal
-    stretches of its time; what is shorter than ``shortest`` after a cut is dropped.
+    If there are at least as many recordings as parts, a part consists of whole recordings. Else every recording is cut
+    into stretches of equal length; pieces shorter than ``shortest`` after a cut are dropped.
 
     Args:
         trajectories: Training trajectories.
-        parts: How many parts; 0 or 1: none.
-        shortest: Samples of a stretch at least: a recording that would give shorter ones is cut less often.
+        parts: Number of parts; 0 or 1: no parts.
+        shortest: Minimum samples of a stretch; a short recording is cut into fewer stretches.
 
     Returns:
-        The trajectories, and the part of each; -1 where there are no parts.
+        The trajectories, and the part of each; -1 without parts.
 
     Example:
         >>> z = np.zeros((100, 1))
@@ -138,21 +142,21 @@ def in_parts(
 
 
 def fitting_horizon(trajectories: Sequence[Trajectory], warm: int, most: int) -> int:
-    """Scored periods of a window that let the shortest trajectory give windows at several starts.
+    """Evaluated periods of a window, so that the shortest trajectory gives windows with several start samples.
 
-    That is two thirds of what the warm-up leaves of it, at most ``most``. Where that is less than half of
-    ``most``, the longest trajectory decides up to that half: one too short then gives no window, which is
-    better than short windows for all.
+    The result is two thirds of the shortest trajectory after its warm-up, at most ``most``. If this is less than half
+    of ``most``, the longest trajectory decides up to that half: a trajectory that is too short then gives no window,
+    which is better than short windows for all.
     """
     lengths = [2 * (len(t.t) - warm - 1) // 3 for t in trajectories]
     return max(1, min(most, max(min(lengths), min(most // 2, max(lengths)))))
 
 
 def validation_horizon(trajectories: Sequence[Trajectory], warm: int) -> int:
-    """Scored periods of a validation window: a drift shows in long runs alone.
+    """Evaluated periods of a validation window; only long runs show a drift.
 
-    That is two thirds of what the warm-up leaves of a usual trajectory (half of all samples lie in ones at least as
-    long), at most ``LONGEST``. Shorter trajectories give no window.
+    The result is two thirds of a typical trajectory after its warm-up, at most ``LONGEST``. Half of all samples lie in
+    trajectories at least as long as the typical one. Shorter trajectories give no window.
     """
     lengths = np.sort([len(t.t) for t in trajectories])[::-1]
     usual = int(lengths[np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum())])
@@ -160,7 +164,7 @@ def validation_horizon(trajectories: Sequence[Trajectory], warm: int) -> int:
 
 
 def check_rates(trajectories: Sequence[Trajectory]) -> None:
-    """Refuse trajectories whose derivative is not known: the paper form is trained on it."""
+    """Refuse trajectories without derivatives, on which the paper's form is trained."""
     for trajectory in trajectories:
         _check_finite(trajectory, ("xdot",))
 

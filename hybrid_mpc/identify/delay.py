@@ -1,4 +1,4 @@
-"""Recordings of a machine whose input acts later: which input acts when, and which samples that costs."""
+"""Recordings of a machine with delayed inputs: the inputs that act in each period, and the samples without them."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 
 NONE = 0.05
-"""Share of a period below which a delay counts as none."""
+"""Delay over the period below which the delay is set to zero."""
 TINY = 1e-9
-"""Share of a period below which the part of a delay beyond whole periods counts as none."""
+"""Fraction of a period below which the fractional part of a delay is set to zero."""
 
 
 def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
-    """The trajectory with the inputs that act under a delay: identification then runs as without one.
+    """Replace the inputs of a trajectory by the inputs that act under a delay, so that no delay remains to identify.
 
-    A delay of ``m`` periods and a share ``f`` gives ``(1 - f) u_{k-m} + f u_{k-m-1}``, the mean of what acts over the
-    period. What acts before the first recorded input has arrived is not known: these samples are left out. ``delay``
+    A delay of ``m + f`` periods, with ``0 <= f < 1``, gives ``(1 - f) u_{k-m} + f u_{k-m-1}``: the mean of the acting
+    input over the period. The acting inputs of the first samples are unknown, so these samples are left out. ``delay``
     [s] is positive.
     """
     whole, rest = _split(delay, trajectory.dt)
@@ -37,18 +37,18 @@ def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
 
 
 def shifted(trajectories: Sequence[Trajectory], delay: float) -> list[Trajectory]:
-    """Trajectories with the inputs that act; as they are without a delay."""
+    """Trajectories with the inputs that act; unchanged without a delay."""
     return [delayed(t, delay) for t in trajectories] if delay else list(trajectories)
 
 
 def lost_samples(delay: float, dt: float) -> int:
-    """Samples at the start of a trajectory whose acting input is not known; none without a delay."""
+    """Number of samples at the start of a trajectory whose acting input is unknown; 0 without a delay."""
     whole, rest = _split(delay, dt) if delay else (0, 0.0)
     return whole + (rest > 0)
 
 
 def _split(delay: float, dt: float) -> tuple[int, float]:
-    """Whole periods of a delay and what is left [s]."""
+    """Whole periods of a delay, and the remaining time [s]."""
     if not (delay > 0 and math.isfinite(delay)):
         raise InputError(
             f"delay: give a positive number, got {delay} s; without a delay, use the prior itself [HM-IDENTIFY-008]"

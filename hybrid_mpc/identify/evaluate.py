@@ -1,4 +1,4 @@
-"""Free runs of models over whole trajectories, and their figures."""
+"""Free runs of models over whole trajectories, and their errors."""
 
 from __future__ import annotations
 
@@ -23,18 +23,29 @@ from hybrid_mpc.machine.signals import Signal
 
 Array = NDArray[np.float64]
 STARTS = 5
-"""Starts of short free runs within the length of one."""
+"""Number of short free runs that start within the length of one run."""
 ROUNDING = 1e-9
-"""Share of a signal's largest value below which its standard deviation is rounding: it does not change."""
+"""Standard deviation over the largest value of a signal below which the signal is constant up to rounding."""
 
 
 @dataclass(frozen=True)
 class FreeRun:
-    """A free run over one trajectory after its warm-up, and the measurement; n scored periods.
+    """A free run over one trajectory after its warm-up, and the measurement, over n periods.
 
-    ``x`` are the measured, smoothed states, ``y`` the measured outputs, not smoothed; ``xdot`` and ``xdot_hat`` are
-    mean rates over each period. ``balances`` ``(n, n_b)`` are the residuals of the prior's balances on the measurement,
-    ``balances_hat`` on the model's own run, each in the balance's ``rate_unit``: the paper's ΔE_S and ΔE_M.
+    Args:
+        name: Name of the trajectory.
+        t: Times ``(n,)`` [s].
+        u: Inputs ``(n, n_u)``.
+        x: Smoothed states ``(n, n_x)``.
+        x_hat: States of the free run ``(n, n_x)``.
+        y: Measured outputs ``(n, n_y)``, not smoothed.
+        y_hat: Outputs of the free run ``(n, n_y)``.
+        xdot: Mean rates of ``x`` over each period ``(n, n_x)``.
+        xdot_hat: Mean rates of ``x_hat`` over each period ``(n, n_x)``.
+        balances: Residuals of the prior's balances on the measurement ``(n, n_b)``, in the balance's ``rate_unit``; the
+            paper's ΔE_S.
+        balances_hat: Residuals on the free run ``(n, n_b)``; the paper's ΔE_M.
+        w: Disturbances ``(n, n_w)``.
     """
 
     name: str
@@ -51,7 +62,7 @@ class FreeRun:
     w: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def squared_errors(self, spread: Sequence[float]) -> Array:
-        """Mean over the outputs of the squared error over ``spread`` ``(n_y,)``, where any was measured ``(m,)``."""
+        """Mean over the outputs of the squared error over ``spread`` ``(n_y,)``, for measured samples ``(m,)``."""
         squares = np.square((self.y_hat - self.y) / np.array(spread))
         seen = np.isfinite(self.y).any(axis=1)
         with np.errstate(invalid="ignore"):
@@ -61,14 +72,13 @@ class FreeRun:
 
 @dataclass(frozen=True)
 class OutputErrors:
-    """How far predicted outputs are off, over all samples that were measured; a diverging run makes them infinite.
+    """Errors of predicted outputs over all measured samples; infinite if a run diverges.
 
     Args:
-        error: Root mean square over the outputs of the error over the output's spread [-]: one number to compare
-            models by, whatever the units.
+        error: Root mean square over the outputs of the error over the output's spread [-]; compares models.
         rmse: Root mean square error by output, ``"phi [rad]"``.
-        fit_percent: ``100 (1 - RMSE / standard deviation of the measurement)`` by output: 100 is perfect, 0 what the
-            mean alone gives. An output that does not change has none.
+        fit_percent: ``100 (1 - RMSE / standard deviation of the measurement)`` by output: 100 for a perfect prediction,
+            0 for the mean. A constant output has no entry.
 
     Source of ``fit_percent``: Ljung, *System Identification Toolbox User's Guide* (NRMSE fit).
     """
@@ -80,11 +90,11 @@ class OutputErrors:
 
 @dataclass(frozen=True)
 class Scores(OutputErrors):
-    """Figures of one model over several free runs; a diverging run makes them infinite.
+    """Errors of one model over several free runs; infinite if a run diverges.
 
     Args:
-        e_sim: Simulation error in duration form: time mean of ``|xdot - xdot_hat|``, each rate over its standard
-            deviation in the measurement, averaged over the states [-]. A rate that does not change is left out.
+        e_sim: Simulation error: time mean of ``|xdot - xdot_hat|``, each rate over its standard deviation in the
+            measurement, averaged over the states [-]. Constant rates are left out.
         violation: Time mean of ``|residual of the model - residual of the measurement|`` by balance, ``"energy [W]"``.
     """
 
@@ -95,17 +105,17 @@ class Scores(OutputErrors):
 def evaluation_trajectories(
     trajectories: Sequence[Trajectory], smoother: Smoother, warm: int, length: float | None = None
 ) -> list[Trajectory]:
-    """The trajectories that a model is evaluated on: their starts are smoothed from their warm-ups alone.
+    """Trajectories for the evaluation of models: their initial states are smoothed from the warm-up alone.
 
     Args:
         trajectories: Test trajectories, smoothed with all their samples (the models' rates are compared with these).
         smoother: Smoother of the warm-ups; the same for every model.
         warm: Samples of the warm-up.
-        length: Length [s] of a run after its warm-up; one starts every fifth of it. A shorter trajectory is one run.
-            Default: every trajectory is one run.
+        length: Length [s] of a run after its warm-up; runs start at intervals of a fifth of this length. A shorter
+            trajectory is one run. Default: every trajectory is one run.
 
     Returns:
-        Trajectories whose first ``warm + 1`` states know the measurements up to sample ``warm`` and none after it.
+        Trajectories whose first ``warm + 1`` states are estimated from the measurements up to sample ``warm`` only.
     """
     pieces = []
     for t in trajectories:
@@ -126,20 +136,21 @@ def unseen_runs(
     smoother: Smoother,
     length: float | None = None,
 ) -> list[tuple[int | None, list[Trajectory]]]:
-    """Trajectories that a training is evaluated on, which its networks did not see: the parts that they left out.
+    """Held-out trajectories of a training: for each network the part of the training data that it left out.
 
-    The validation is none of them: the networks' weights were chosen by it. It is where nothing could be left out.
+    Validation trajectories are not held out, because they selected the networks' weights. They are used only if no
+    network left a part out.
 
     Args:
-        settings: Of the training.
-        training: Trajectories that it was given to train on, smoothed.
-        validation: Those that its weights were chosen by.
+        settings: Settings of the training.
+        training: Training trajectories, smoothed.
+        validation: Validation trajectories.
         smoother: Smoother of the warm-ups; the same for every model.
         length: As in :func:`evaluation_trajectories`.
 
     Returns:
-        Pairs of the network that is to run alone, None for the mean of all, and what over. There is no pair without
-        trajectories.
+        Pairs of a network's number (None: the mean of all networks) and the trajectories for its free runs. Pairs
+        without trajectories are left out.
     """
     pieces, part = in_parts(training, settings.parts, settings.shortest)
     unseen: list[tuple[int | None, list[Trajectory]]] = [
@@ -153,11 +164,11 @@ def unseen_runs(
 def free_runs(
     step: Step, prior: Prior, trajectories: Sequence[Trajectory], warm: int, h0: Tensor | None = None
 ) -> list[FreeRun]:
-    """Free runs of one model over trajectories; the warm-up is given and not scored.
+    """Compute free runs of one model over trajectories; the warm-up is given and not evaluated.
 
     Args:
         step: The model.
-        prior: The prior whose balances and outputs count (the fitted one).
+        prior: The prior that defines balances and outputs (the fitted one).
         trajectories: The trajectories (:func:`evaluation_trajectories`); they may differ in length.
         warm: Samples of the warm-up.
         h0: Hidden state before the warm-up ``(n_h,)``. Default: zero.
@@ -178,7 +189,7 @@ def free_runs(
 def stacked_free_runs(
     trained: Trained, prior: Prior, dt: float, balance: Prior, trajectories: Sequence[Trajectory], warm: int
 ) -> list[list[FreeRun]]:
-    """:func:`free_runs` of all networks of a training at once: those of the first network, the second, ..."""
+    """:func:`free_runs` of all networks of a training at once, by network."""
     step = trained.stacked_step(prior, dt)
     x_hat = model_states(step, trajectories, warm)
     return [[_free_run(balance, t, x[i], warm) for i, t in enumerate(trajectories)] for x in x_hat]
@@ -187,10 +198,10 @@ def stacked_free_runs(
 def model_states(
     step: Step, trajectories: Sequence[Trajectory], warm: int, h0: Tensor | None = None
 ) -> Array:
-    """States of a model that runs freely from sample ``warm`` on, ``(..., runs, samples - warm + 1, n_x)``.
+    """States of a model's free runs from sample ``warm`` on, ``(..., runs, samples - warm + 1, n_x)``.
 
-    Shorter trajectories go on under their last input. ``h0`` ``(n_h,)``, of a stack ``(networks, 1, n_h)``, is the
-    hidden state before the warm-up; default zero.
+    Shorter trajectories continue with their last input. ``h0`` is the hidden state before the warm-up ``(n_h,)``, for a
+    stack ``(networks, 1, n_h)``. Default: zero.
     """
     h0 = step.h0 if h0 is None else h0
     longest = max(len(t.t) for t in trajectories)
@@ -209,16 +220,16 @@ def model_states(
 
 
 def score(runs: Sequence[FreeRun], prior: Prior, spread: Sequence[float] | None = None) -> Scores:
-    """Figures over all samples of free runs, by the names and units of the prior's signals and balances.
+    """Compute the errors over all samples of free runs, by names and units of the prior's signals and balances.
 
     Args:
         runs: Free runs (:func:`free_runs`).
-        prior: The prior whose outputs and balances they have.
-        spread: Spread of each output ``(n_y,)`` [output units] that ``error`` is over, e.g. ``fit.sizes.y``. Default:
+        prior: The prior that defines outputs and balances.
+        spread: Spread of each output ``(n_y,)`` [output units], which scales ``error``, e.g. ``fit.sizes.y``. Default:
             the standard deviations of the measurement in these runs.
 
     Raises:
-        InputError: If there is no run, or an output was never measured in them.
+        InputError: If there is no run, or an output was never measured in the runs.
 
     Example:
         >>> from hybrid_mpc import PriorStep
@@ -248,16 +259,16 @@ def output_errors(
     outputs: Sequence[Signal],
     spread: Sequence[float] | None = None,
 ) -> OutputErrors:
-    """How far predicted outputs are off the measured ones, over all runs.
+    """Compute the errors of predicted outputs over all runs.
 
     Args:
-        y_hat: Predictions of each run ``(n, n_y)``, and
-        y: the measurement; NaN where a sample is missing.
+        y_hat: Predictions of each run ``(n, n_y)``.
+        y: Measurement of each run ``(n, n_y)``; NaN where a sample is missing.
         outputs: Signals of ``y``.
-        spread: As :func:`score` has it.
+        spread: As in :func:`score`.
 
     Raises:
-        InputError: If there is no run, or an output was never measured in them.
+        InputError: If there is no run, or an output was never measured in the runs.
 
     Example:
         >>> y = np.array([[0.0], [1.0], [2.0]])
@@ -276,7 +287,7 @@ def output_errors(
                 f"output {signal.label}: never measured in the evaluated free runs. Give recordings with it "
                 "[HM-IDENTIFY-010]"
             )
-        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinitely wrong
+        with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite error
             rmse.append(_finite(np.sqrt(np.mean(np.square(guess[seen] - truth[seen])))))
         size = float(truth[seen].std())
         sizes.append(size if size > ROUNDING * float(np.abs(truth[seen]).max()) else 0.0)
@@ -290,7 +301,7 @@ def output_errors(
 
 
 def _finite(value: Any) -> float:
-    """The number; infinite where a run has diverged."""
+    """The number; infinite if a run has diverged."""
     return float(value) if np.isfinite(value) else float("inf")
 
 
@@ -324,7 +335,7 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
 
 
 def measured_as(prior: Prior, y: Array) -> Array:
-    """Outputs ``(..., n_y)`` as the sensors show them: within the ranges that they declare."""
+    """Clip outputs ``(..., n_y)`` to the sensors' declared ranges."""
     ends = [s.saturation or (-np.inf, np.inf) for s in prior.outputs]
     return np.asarray(np.clip(y, [low for low, _ in ends], [high for _, high in ends]))
 
@@ -334,20 +345,19 @@ def _padded(values: Array, length: int) -> Array:
 
 
 def input_correlation(errors: Sequence[Array], inputs: Sequence[Array], lags: int) -> tuple[Array, float]:
-    """What of free runs' errors an input of before explains: their correlation, and the band of independent ones.
+    """Correlation of free-run errors with an earlier input, and the band of independent signals.
 
-    Beyond the band something that this input drives is missing in the model, or has another size or delay there. Both
-    signals remember, so the band is Bartlett's, ``1.96 sqrt(sum_k rho_e(k) rho_u(k) / n)``, with their own
-    autocorrelations.
+    A correlation outside the band means that the model lacks an effect of this input, or has a wrong gain or delay.
+    Both signals are autocorrelated, so the band is Bartlett's: ``1.96 sqrt(sum_k rho_e(k) rho_u(k) / n)``.
 
     Args:
-        errors: Errors of an output in each run ``(n,)``; NaN where it was not measured.
-        inputs: The input beside it ``(n,)``.
-        lags: Longest lag [samples].
+        errors: Errors of an output in each run ``(n,)``; NaN for a missing sample.
+        inputs: The input in each run ``(n,)``.
+        lags: Largest lag [samples].
 
     Returns:
-        Correlations at lags 0 to ``lags`` ``(lags + 1,)``, and half the width of the 95 % band; NaN where one of the
-        two does not move.
+        Correlations at lags 0 to ``lags`` ``(lags + 1,)``, and half the width of the 95 % band; NaN if one of the two
+        signals is constant.
 
     Source: Box, Jenkins, Reinsel, Ljung, *Time Series Analysis*, 5th edition, 2015, section 12.1; Ljung, *System
     Identification*, 2nd edition, 1999, section 16.6.

@@ -1,4 +1,4 @@
-"""What a search for missing terms found, as plain data: for tables, pictures and files. No torch in here."""
+"""Result of a search for missing terms, as plain data for tables, pictures and files. No torch in here."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FittedParameter:
         standard_error: Standard error of the value [unit]; 0 for a fixed parameter.
         lower: Lower bound of the fit [unit].
         upper: Upper bound of the fit [unit].
-        description: A few words.
+        description: Short description.
 
     Example:
         >>> print(FittedParameter("F", 0.1523, "N m", 0.0041, 0.0, 1.0))
@@ -54,16 +54,16 @@ class FittedParameter:
 
 @dataclass(frozen=True)
 class HeldOutError:
-    """Error of free runs over held-out data: root mean square over the outputs' spreads, first states fitted.
+    """Error of free runs over held-out data: root mean square over the outputs' spreads, initial states fitted.
 
     Args:
-        error: With the change [-].
-        ratio: That over the error without the change [-]: the geometric mean over the pieces of evidence.
-        lower: Lower end of its interval [-]: the probability of an error beyond it is 10 %, shared by the candidates
-            that were fitted in the step.
-        upper: Upper end of its interval [-], likewise; infinite where there are too few pieces of evidence.
-        harm: Probability that the expected error is more than 5 % larger with the change, times the number of
-            candidates that were fitted in the step, at most 1.
+        error: Error with the change [-].
+        ratio: Error with the change over the error without it [-]: geometric mean over the pieces of evidence.
+        lower: Lower end of the ratio's interval [-]. The probability of a ratio below it is 10 %, divided by the number
+            of candidates that were fitted in the step.
+        upper: Upper end of the ratio's interval [-], likewise; infinite with too few pieces of evidence.
+        harm: Probability that the change increases the expected error by more than 5 %, times the number of candidates
+            that were fitted in the step, at most 1.
     """
 
     error: float
@@ -79,11 +79,12 @@ class FoundTerm:
 
     Args:
         name: Its name, e.g. ``"Coulomb friction of phi_dot"``.
-        formula: What it adds, or puts in place of its signal.
-        explanation: What it is, in a sentence.
-        place: Where it stands: ``"force"``, ``"potential"``, ``"rate"``, ``"input"``, ``"disturbance"``, ``"output"``.
+        formula: Formula of the added term, or of the signal that replaces the original one.
+        explanation: Description in a sentence.
+        place: Place in the prior: ``"force"``, ``"potential"``, ``"rate"``, ``"input"``, ``"disturbance"``,
+            ``"output"``.
         of: The speed, state, input, disturbance or output.
-        code: The call that makes it, for a file; empty for a user's own term without one.
+        code: The call that creates the term, for a file; empty for a user's own term without one.
         made: The call as data, for :meth:`Explanation.prior`; None for a user's own term.
     """
 
@@ -98,14 +99,15 @@ class FoundTerm:
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate that was fitted in a step, and what came of it.
+    """A candidate that was fitted in a step, and the outcome.
 
     Args:
         terms: The candidate's terms: one, or a pair.
-        outcome: ``"added"``; ``"alternative"``: the data do not tell it from what was added; ``"unsure"``: it may
-            lower the error, but not surely; ``"worse"``: it does not lower it; ``"diverged"``: its fit failed.
-        held_out: Its error over held-out data; None where the fit failed, or did not lower the error of all data.
-        reason: Why it was not added; empty where it was.
+        outcome: ``"added"``; ``"alternative"``: not significantly different from the added terms; ``"unsure"``: the
+            error is smaller, but not significantly; ``"worse"``: the error is not smaller; ``"diverged"``: the fit
+            failed.
+        held_out: Error over held-out data; None if the fit failed or did not reduce the error over all data.
+        reason: Why the candidate was not added; empty if it was.
     """
 
     terms: tuple[FoundTerm, ...]
@@ -124,14 +126,13 @@ class TermPicture:
     """A term over its data, for a picture.
 
     Args:
-        abscissa: Label of what it is drawn over, with unit, e.g. ``"phi_dot [rad/s]"``.
-        ordinate: Label of what it adds, with unit.
-        at: Where the recordings were, increasing ``(n,)``.
-        term: What the term adds there.
-        low: That less two standard errors of its parameters.
-        high: That and two standard errors.
-        data: What the recordings ask for there: the term and what the model with all terms leaves of the rates; empty
-            where no rate or output shows it.
+        abscissa: Label of the horizontal axis with unit, e.g. ``"phi_dot [rad/s]"``.
+        ordinate: Label of the vertical axis with unit.
+        at: Points of the recordings on the horizontal axis, increasing ``(n,)``.
+        term: Value of the term at each point.
+        low: Value of the term minus two standard errors of its parameters.
+        high: Value of the term plus two standard errors.
+        data: Value of the term plus the residual of the model with all terms; empty if no rate or output shows it.
     """
 
     abscissa: str
@@ -145,16 +146,16 @@ class TermPicture:
 
 @dataclass(frozen=True)
 class ExplainStep:
-    """A step of the search: a term or a pair that was added, or a term that a later one made needless.
+    """A step of the search: a term or pair that was added, or a term that was removed as superfluous.
 
     Args:
         action: ``"added"`` or ``"removed"``.
         terms: One term, or a pair.
-        held_out: Error with the step's change, over that before the step.
-        parameters: Fitted values of the terms' parameters: of the last fit, or of the step for removed terms.
-        scored: Candidates that were scored in the step by one Gauss-Newton step.
-        trials: Candidates that were fitted, the best first; the alternatives are among them.
-        pictures: Of each term; empty for terms that were removed later.
+        held_out: Error with the step's change, compared with the error before the step.
+        parameters: Fitted values of the terms' parameters: from the last fit, or from this step for removed terms.
+        scored: Number of candidates that were scored by one Gauss-Newton step.
+        trials: Candidates that were fitted, the best first, including the alternatives.
+        pictures: Picture of each term; empty for terms that were removed later.
     """
 
     action: Action
@@ -172,20 +173,20 @@ class ExplainStep:
 
     @property
     def alternatives(self) -> tuple[Trial, ...]:
-        """Candidates that the data do not tell from what was added."""
+        """Candidates that are not significantly different from the added terms."""
         return tuple(trial for trial in self.trials if trial.outcome == "alternative")
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the search was judged by.
+    """Evidence of the search.
 
     Args:
-        recordings: Recordings.
-        pieces: Pieces of evidence: recordings, or blocks of them where they are few.
-        folds: Groups of these that were left out in turn.
+        recordings: Number of recordings.
+        pieces: Number of independent pieces of evidence: recordings, or blocks of recordings if these are few.
+        folds: Number of groups that were held out in turn.
         length: Length [s] of the free runs.
-        text: The same in words.
+        text: The evidence in words.
     """
 
     recordings: int
@@ -197,20 +198,20 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Explanation:
-    """The terms that recordings ask for beside a prior, and all that a table and a page show of the search.
+    """The terms that a prior lacks, and all data about the search for tables and pages.
 
-    It is plain data: :func:`hybrid_mpc.records.plain` writes it, :func:`hybrid_mpc.records.record` reads it.
+    The object is plain data: :func:`hybrid_mpc.records.plain` writes it, :func:`hybrid_mpc.records.record` reads it.
 
     Args:
         base: Name of the prior's class.
-        nominal: Error of the nominal parameters over the same data [-].
+        nominal: Error with the nominal parameters over the same data [-].
         before: Held-out error of the fitted prior without terms [-].
-        after: Held-out error with all terms, over that without any.
+        after: Held-out error with all terms, compared with the error without terms.
         steps: Steps of the search in order.
         last: Candidates that were fitted in the last step, in which nothing was added.
         parameters: Fitted values of all parameters, the prior's first.
-        evidence: What the search was judged by.
-        candidates: Candidates of the library.
+        evidence: Evidence of the search.
+        candidates: Number of candidates in the library.
         reason: Why the search ended.
     """
 
@@ -244,7 +245,7 @@ class Explanation:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Their standard errors."""
+        """Standard errors [their units] of all parameters by name."""
         return {p.name: p.standard_error for p in self.parameters}
 
     @property
@@ -254,10 +255,10 @@ class Explanation:
         return tuple(trial for trial in trials if trial.outcome == "diverged")
 
     def terms(self, own: Sequence[Term] = ()) -> tuple[Term, ...]:
-        """The terms that remain, made again.
+        """Create the terms that remain.
 
         Args:
-            own: A user's own terms, which only their own code can make.
+            own: A user's own terms, which only the user's code can create.
 
         Raises:
             InputError: If a term without a call is not among ``own``.
@@ -266,17 +267,18 @@ class Explanation:
         for term in self.found:
             if term.made is None and term.name not in given:
                 raise InputError(
-                    f"term {term.name!r} was made by own code; give it: explanation.terms([term]) [HM-IDENTIFY-015]"
+                    f"term {term.name!r}: only its own code can create it; call explanation.terms([term])"
+                    " [HM-IDENTIFY-015]"
                 )
             made.append(given[term.name] if term.made is None else again(term.made))
         return tuple(made)
 
     def prior(self, base: type[Prior], own: Sequence[Term] = ()) -> type[Prior]:
-        """The prior's class with the terms; ``prior(base)(explanation.values)`` has the fitted values.
+        """Create the prior's class with the terms; ``prior(base)(explanation.values)`` has the fitted values.
 
         Args:
-            base: The prior's class, that the search began with.
-            own: A user's own terms, which only their own code can make.
+            base: The prior's class at the start of the search.
+            own: A user's own terms, which only the user's code can create.
         """
         return extended(base, *self.terms(own))
 
@@ -286,7 +288,7 @@ def _named(terms: Sequence[FoundTerm]) -> str:
 
 
 def bound(upper: float) -> str:
-    """An upper bound in words.
+    """Text of an upper bound.
 
     Example:
         >>> bound(0.912), bound(math.inf)

@@ -1,4 +1,4 @@
-"""From a torch step to programs: the bridge between the offline and the online half."""
+"""Export of a torch step as programs for the deployed model."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Parity:
 
 
 class _Model(nn.Module):
-    """``step`` or ``xdot`` of a model, which is what gets traced."""
+    """``step`` or ``xdot`` of a model, for tracing."""
 
     def __init__(self, step: Step, method: str) -> None:
         super().__init__()
@@ -43,15 +43,15 @@ class _Model(nn.Module):
 def trace_model(
     step: Step, like: Mapping[str, nn_export.Program] | None = None
 ) -> dict[str, nn_export.Program]:
-    """Programs ``step, xdot, output`` of one model, and of its prior's balances.
+    """Trace the programs ``step, xdot, output`` of one model, and those of its prior's balances.
 
-    The prior changes with ``p``; what a network adds does not: it was trained next to the fitted prior. Parameters that
-    were trained along with a network move by as much as ``p`` differs from the fitted ones.
+    The prior depends on ``p``; the network's correction does not, since it was trained with the fitted prior.
+    Parameters that were trained with a network change by the difference of ``p`` from the fitted parameters.
 
     Args:
         step: The model.
-        like: Programs of another network of the same training, alone as this one: their weights alone are exchanged,
-            which is a hundred times as fast. Default: it is traced.
+        like: Programs of another single network of the same training; only their weights are replaced, which is a
+            hundred times faster. Default: the model is traced.
     """
     substeps = step.substeps if isinstance(step, PriorStep) else 0
     programs, examples = prior_programs(step.prior, step.dt, substeps), _examples(step)
@@ -77,9 +77,9 @@ def check_parity(
     seed: int,
     samples: int = 100,
 ) -> Parity:
-    """Measure the exported step against torch on random and extreme inputs of the trajectories' magnitude.
+    """Compare the exported step with torch, on random and extreme inputs of the trajectories' magnitude.
 
-    The step's parameters are the fitted ones.
+    The parameters are the fitted ones.
     """
     model = build_model("m", {f"m/{name}": program for name, program in programs.items()}, info)
     point = step_symbols(model)
@@ -96,7 +96,7 @@ def check_parity(
 
 
 def _with_weights(program: nn_export.Program, module: nn.Module) -> nn_export.Program:
-    """The same operators with the weights of another module of the same structure."""
+    """Replace the weights of a program by those of another module of the same structure."""
     own = {**dict(module.named_parameters()), **dict(module.named_buffers())}
     held = {n: own[n].detach().numpy().copy() if n in own else w for n, w in program.weights.items()}
     strange = [name for name, value in held.items() if value.shape != program.weights[name].shape]

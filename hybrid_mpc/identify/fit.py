@@ -1,8 +1,8 @@
-"""Fit of a prior to measured outputs: multiple shooting with free first states, exact derivatives, a robust loss.
+"""Fit of a prior to measured outputs: multiple shooting with free initial states, exact derivatives, a robust loss.
 
-Recordings are cut into windows. The state at the start of each is an unknown that is eliminated from every
-Gauss-Newton step, so that no measured state is taken for exact and states that no sensor sees need no measurement.
-All windows and all directions are one batch of array operations (:mod:`~hybrid_mpc.identify.simulation`).
+Recordings are cut into windows. The initial state of each window is unknown and is eliminated from every Gauss-Newton
+step. So measured states need not be exact, and unmeasured states are estimated. All windows and all derivatives are one
+batch of array operations (:mod:`~hybrid_mpc.identify.simulation`).
 """
 
 from __future__ import annotations
@@ -50,28 +50,28 @@ from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 LENGTHS = (0.5, 2.0, 5.0)
-"""Lengths of the windows [time units, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other: short
-ones have one optimum, long ones are what counts."""
+"""Lengths of the windows [time units, :func:`~hybrid_mpc.data.scales.time_unit`], one after the other. Short windows
+have a single optimum; long windows match the use of the model."""
 FARTHEST = 3.0
-"""Length of the longest windows at most, over the time in which small errors grow a hundredfold: first states would be
-lost in rounding, and no digit of them would be found."""
+"""Maximum length of the longest windows, over the time in which small errors grow by a factor of 100. In longer windows
+rounding errors would dominate the effect of the initial states."""
 APART = 4.0
-"""Ratio of one length to the next at most."""
+"""Maximum ratio of one length to the next."""
 SLOWEST = 3.0
 """Length of the longest windows, over the largest time constant of the nominal prior."""
 AWAY = 10.0
-"""Time in which small errors grow a hundredfold, over the longest windows, up to which each length's fit smooths the
-recordings anew: there the nominal prior's states are no start for longer windows."""
+"""Time in which small errors grow by a factor of 100, over the longest windows, below which the recordings are smoothed
+again after each length: the nominal prior's states are then no initial states for longer windows."""
 WHOLE = 1.2
-"""Ratio of the longest recording to the windows before from which on whole recordings are fitted, where it pays."""
+"""Ratio of the longest recording to the windows from which on whole recordings are fitted too."""
 QUIET = 3.0
-"""Ratio of what is left to the sensors' noise up to which windows grow on beyond that."""
+"""Ratio of the error to the sensors' noise below which longer windows or whole recordings are fitted."""
 SHIFT, EXACT = 0.2, 1e-5
-"""Shift of a parameter by half as long integration steps that is small enough: standard errors, and share of it."""
+"""Tolerated change of a parameter when integration steps are halved: in standard errors, and relative to its value."""
 BEYOND = 0.05
-"""Share of a state's own span by which it may leave its range: a smoother overshoots."""
+"""Tolerated distance of a state beyond its range, over the span of the state: a smoother overshoots."""
 FORGETS = 2.0
-"""Length of the windows of predictions [time units]: an observer forgets where it began."""
+"""Length of the windows of one-step predictions [time units]; the observer forgets its initial state within it."""
 Progress = Callable[[int, int, str], None]
 
 
@@ -88,40 +88,41 @@ def fit_prior(
     first_states: FirstStates = FREE,
     on_progress: Progress = lambda done, total, text: None,
 ) -> PriorFit:
-    """Fit parameters and delay to the measured outputs over longer and longer windows, and find what smooths states.
+    """Fit parameters and delay to the measured outputs over windows of increasing length, and fit the smoother.
 
-    Each length starts from what explains its windows best of what is known: the nominal values, the best of several
-    starts between the bounds, and what shorter windows found; up to ``FOLLOWED`` of them are followed where they do
-    about as well. A machine on which small errors grow gets windows no longer than these take to grow a hundredfold,
-    unless little more than the sensors' noise is left; where that is all that is left, whole recordings come last. Of
-    the nominal values and all lengths the one wins that explains the longest windows best, over training and validation
-    recordings together: few parameters do not overfit, and where a machine drifts a short validation part alone
-    misleads. A prior without free parameters stays as it is.
+    1. **Starts.** Each length starts from the best of: nominal values, several points between the bounds, and results
+       of shorter windows. Up to ``FOLLOWED`` starts are followed if their errors are similar.
+    2. **Lengths.** On an unstable machine, windows are not longer than the time in which small errors grow by a factor
+       of 100, unless the error is close to the sensors' noise. If it is, whole recordings come last.
+    3. **Selection.** Of the nominal values and all lengths, the result with the least error over the longest windows is
+       used, on training and validation recordings together. (A few parameters hardly overfit, and on a drifting machine
+       a short validation part alone would mislead.)
+    4. **Regularization.** A weak pull towards the nominal values keeps parameters that are not identifiable there.
+    5. **Integration.** At the end, integration steps are halved until this no longer changes a parameter significantly.
 
-    Parameters are held loosely at their nominal values, so that what the data do not tell stays where it is. At the end
-    integration steps are halved until that moves no parameter by what counts. The order of the recordings is no matter,
-    and those that follow each other within a period count as one (:func:`continued`).
+    The order of the recordings does not matter, and recordings that follow each other within a period are joined
+    (:func:`continued`). A prior without free parameters stays unchanged.
 
-    Recordings whose inputs answer to the outputs (:func:`feedback`) warn, and the errors of predictions are fitted too.
-    Inputs that seem to act late warn where parameters are fitted and no delay is, and first states are not known ones.
+    If inputs respond to outputs (:func:`feedback`), the fit warns and also fits one-step prediction errors. If inputs
+    seem to act late although no delay is fitted, the fit warns, unless initial states are known or shared.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         train: Training trajectories.
-        valid: Validation trajectories (chosen by, not fitted to).
+        valid: Validation trajectories (used for the selection only).
         dt: Model period [s].
-        length: Length [s] of the longest windows: that of the runs that the model will be evaluated by. Default: 5 of
-            time units, or 3 of the nominal prior's largest time constant where that is more.
-        largest_delay: Longest delay [s] of the inputs. Default 0: they act at once.
-        start: Values [their units] by name to try as a start besides the nominal ones, e.g. those of a global search;
-            fixed parameters are left out. Default: none.
+        length: Length [s] of the longest windows: that of the free runs of the model's evaluation. Default: 5 time
+            units, or 3 times the largest time constant of the nominal prior if that is longer.
+        largest_delay: Largest delay [s] of the inputs. Default 0: no delay is fitted.
+        start: Values [their units] by name of another start, e.g. of a global search; fixed parameters are ignored.
+            Default: none.
         time_unit: The machine's time unit [s]. Default: that of the training trajectories.
-        first_states: What is known of the states that free runs start from. Default: nothing, they are free.
+        first_states: Knowledge about the initial states of free runs. Default: none, all are free.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
-        InputError: If a state is seen by no output, no trajectory is long enough, or the prior diverges with all
-            parameters tried.
+        InputError: If a state is not observable, no trajectory is long enough, or the prior diverges with all tested
+            parameters.
 
     Example:
         >>> from scenarios.pendulum.data import exact_runs
@@ -133,11 +134,11 @@ def fit_prior(
 
     Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
     """
-    if first_states.kind not in ("known", "shared"):  # which are those of each trajectory's first sample
+    if first_states.kind not in ("known", "shared"):  # these belong to the first sample of each trajectory
         train, valid = continued(train), continued(valid)
     train, valid = (
         sorted(part, key=place_among) for part in (train, valid)
-    )  # the order of files is no matter
+    )  # so that the order of files does not matter
     fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
     check_observable(fit.prior, dt, unit)
@@ -160,7 +161,7 @@ def fit_prior(
         fit.points = visited(every)
     guesses = every[: len(train)], every[len(train) :]
     moved = [robust_spread(column) for column in np.concatenate([t.x for t in guesses[0]]).T]
-    sizes = np.maximum(smoother.sizes.x, moved)  # a rough guess is no measurement
+    sizes = np.maximum(smoother.sizes.x, moved)  # a smoothed state is only a rough initial guess
     lengths = _lengths(train, dt, unit, length, fit.lead, fit.reach(fit.nominal))
     total = len(lengths) + 2
 
@@ -188,10 +189,10 @@ def fit_prior(
                 break
             name, longer = f"free runs of {own * dt:.3g} s", problem_of(guesses[0], own)
             on_progress(2 + i, total, name)
-            every_start = [fit.nominal, *begun, *followed]  # short windows may have led astray
+            every_start = [fit.nominal, *begun, *followed]  # short windows may have led to a wrong optimum
             solved = [longer.solve(one) for one in promising(fit, longer, every_start)]
             if beyond and not any(_quiet(longer, one.theta, noise) for one in solved):
-                break  # first states that explain so long windows were not found
+                break  # no initial states were found that explain windows of this length
             periods, problem = own, longer
             if own == lengths[-1]:
                 solved += further_starts(fit, problem, solved)
@@ -209,7 +210,7 @@ def fit_prior(
                 guesses = every[: len(train)], every[len(train) :]
         whole = most_samples(guesses[0]) - fit.lead - 1
         more = whole > WHOLE * periods and 0.8 * min(whole, LONGEST) * dt < fit.reach(followed[0])
-        if more and _quiet(problem, followed[0], noise):  # each window spends some numbers on its first state
+        if more and _quiet(problem, followed[0], noise):  # fewer windows have fewer unknown initial states
             on_progress(total - 1, total, "whole recordings")
             longer = problem_of(guesses[0], None)
             solution = longer.solve(followed[0])
@@ -218,7 +219,9 @@ def fit_prior(
                 found.append(("whole recordings", [solution], longer))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ()))]
     problems = {}
-    for name, solved, problems[name] in found:  # of each length what is best over the longest windows
+    for name, solved, problems[
+        name
+    ] in found:  # of each length the result that is best over the longest windows
         errors = _errors_of([one.theta for one in solved], scoring)
         candidates.append((name, solved[int(np.argmin(errors))]))
     scores = _errors_of([c.theta for _, c in candidates], scoring)
@@ -239,7 +242,7 @@ def fit_prior(
         chosen = _with_enough_substeps(fit, problems[name], chosen)
         settled = problems[name].settled(chosen.theta)
         before, after = problems[name].explained([chosen.theta, settled.theta])
-        chosen = settled if after <= ENOUGH * before else chosen  # weights that follow may favour one output
+        chosen = settled if after <= ENOUGH * before else chosen  # its updated weights may favour one output
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
     answered = feedback(acting, smoother.prediction_errors(acting, smoother.prior.p[None])[1])
@@ -282,10 +285,10 @@ def refit(
     dt: float,
     lengths: Sequence[float],
 ) -> PriorFit:
-    """Parameters fitted anew to recordings of a machine that has changed, from those of an earlier fit on.
+    """Fit the parameters again to recordings of a machine that has changed, starting from an earlier fit.
 
-    The delay and what smooths states stay. ``lengths`` [s] are those of the windows, one after the other; none
-    is longer than the longest recording.
+    Delay and smoother stay unchanged. ``lengths`` [s] are the lengths of the windows, one after the other, limited by
+    the longest recording.
     """
     known = smoothed(make, fit, trajectories, dt)
     own, sizes, stages = OutputFit(make, dt), np.array(fit.smoother(make(fit.values), dt).sizes.x), []
@@ -308,12 +311,12 @@ def refit(
 def smoothed(
     make: Callable[..., Prior], fit: PriorFit, trajectories: Sequence[Trajectory], dt: float
 ) -> list[Trajectory]:
-    """Trajectories with the inputs that act and the states that the fitted prior smooths: what networks train on."""
+    """Trajectories with the inputs that act, and with states smoothed by the fitted prior; networks train on these."""
     return fit.smoother(make(fit.values), dt).smooth(shifted(trajectories, fit.delay))
 
 
 def beyond_ranges(prior: Prior, smoothed: Sequence[Trajectory]) -> tuple[str, ...]:
-    """A warning for each state that leaves its declared range where the prior smooths recordings.
+    """Warnings about states that leave their declared range in the smoothed recordings.
 
     Example:
         >>> from scenarios.pendulum.data import exact_runs
@@ -333,12 +336,14 @@ def beyond_ranges(prior: Prior, smoothed: Sequence[Trajectory]) -> tuple[str, ..
 def parameter_variance(
     prior: Prior, covariance: Array, x: Array, u: Array, w: Array, dt: float, substeps: int = 0
 ) -> Array:
-    """Variance of the outputs of free runs by that of the parameters ``(b, n, n_y)`` [output units^2].
+    """Variance of the outputs of free runs due to the parameters' covariance ``(b, n, n_y)`` [output units^2].
+
+    To first order: ``S C S'`` with the sensitivities ``S`` of the outputs and the covariance ``C``.
 
     Args:
         prior: The fitted prior.
-        covariance: Covariance of its parameters ``(n_p, n_p)``; empty where it is not known, which counts as none.
-        x: First states ``(b, n_x)``.
+        covariance: Covariance of its parameters ``(n_p, n_p)``; empty if unknown, which gives a variance of zero.
+        x: Initial states ``(b, n_x)``.
         u: Inputs ``(b, n, n_u)``.
         w: Disturbances ``(b, n, n_w)``.
         dt: Period [s].
@@ -348,7 +353,7 @@ def parameter_variance(
         return np.zeros((*u.shape[:2], len(prior.outputs)))
     free = tuple(range(len(prior.parameters)))
     simulation = simulation_of(prior.equations.xdot, dt, free, prior.equations.output)
-    with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is as uncertain as can be
+    with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite variance
         _, slope = simulation.by_parameters(x, u, w, prior.p, substeps or required_substeps(prior, dt))
         variance = np.sum((slope @ covariance) * slope, axis=-1)
     return np.asarray(np.nan_to_num(np.maximum(variance, 0.0), nan=np.inf))
@@ -358,7 +363,7 @@ def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
     """Refuse a prior with unobservable states.
 
     Raises:
-        InputError: Naming the states.
+        InputError: If a state is not observable; names the states.
     """
     unseen = unseen_states(prior, dt, time_unit)
     if unseen:
@@ -371,7 +376,7 @@ def check_observable(prior: Prior, dt: float, time_unit: float) -> None:
 
 
 def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: float) -> list[Trajectory]:
-    """Trajectories with states smoothed roughly, inputs as commanded, and without the samples that a delay costs."""
+    """Trajectories with roughly smoothed states and commanded inputs, without the first samples under a delay."""
     made = []
     for t, s in zip(trajectories, smoother.smooth(shifted(trajectories, delay)), strict=True):
         made.append(replace(t.part(slice(len(t.t) - len(s.t), None)), x=s.x, xdot=s.xdot))
@@ -379,7 +384,7 @@ def with_states(trajectories: Sequence[Trajectory], smoother: Smoother, delay: f
 
 
 def slowest(prior: Prior) -> float:
-    """Largest time constant [s] of the prior at rest; that of an integrator or an unstable mode is none."""
+    """Largest time constant [s] of the prior at rest; integrators and unstable modes are ignored."""
     modes = np.linalg.eigvals(flow_slope(prior.equations.xdot)(*rest_of(prior), prior.p).full())
     rates = -modes.real[-modes.real > 1e-9 * np.abs(modes).max(initial=0.0)]
     return float(1.0 / rates.min()) if len(rates) else 0.0
@@ -388,11 +393,12 @@ def slowest(prior: Prior) -> float:
 def _lengths(
     train: Sequence[Trajectory], dt: float, unit: float, length: float, lead: int, reach: float
 ) -> list[int]:
-    """Periods of the windows, the longest last; what the recordings do not hold is cut to half of the longest.
+    """Lengths of the windows [periods], the longest last; half the longest recording if none of them fits.
 
-    Of a machine on which a small error grows by the larger of ``GROWN`` over ``reach`` [s] two shorter ones come first.
+    ``reach`` [s] is the time in which a small error grows by the larger of ``GROWN``; on an unstable machine, two
+    windows within this time come first.
     """
-    longest = most_samples(train) - 2 * lead - 1  # smoothing under a delay costs as many samples again
+    longest = most_samples(train) - 2 * lead - 1  # smoothing under a delay loses as many samples again
     length = min(length, longest * dt)
     wanted = [own for own in (unit * own for own in LENGTHS) if own < 0.7 * length]
     while wanted and length > 1.5 * APART * wanted[-1]:  # from one length to the next errors must stay small
@@ -407,16 +413,16 @@ def _lengths(
 
 
 def _quiet(problem: Shooting, theta: Array, noise: Array) -> bool:
-    """Whether of the windows little more is left than the sensors' noise ``(n_y,)``."""
+    """Whether the error over the windows is close to the sensors' noise ``(n_y,)``."""
     share = problem.seen.sum(axis=(0, 1)) / max(problem.seen.sum(), 1)
     least = math.sqrt(float(share @ np.square(noise / problem.spread)))
     return problem.explained([theta])[0] <= QUIET * least
 
 
 def _with_enough_substeps(fit: OutputFit, problem: Shooting, found: Fitted) -> Fitted:
-    """The same fit with integration steps so short that halving them moves no parameter by what counts.
+    """Continue the fit with more sub-steps until halving the steps no longer changes a parameter significantly.
 
-    Their number stays the least of this fit. The move is that of a Gauss-Newton step by the change of the outputs.
+    The change is that of a Gauss-Newton step due to the change of the outputs.
     """
     while (substeps := fit.substeps(found.theta)) <= MAX_SUBSTEPS // 2:
         error = np.sqrt(np.diag(found.covariance))
@@ -431,6 +437,6 @@ def _with_enough_substeps(fit: OutputFit, problem: Shooting, found: Fitted) -> F
 
 
 def _errors_of(thetas: Sequence[Array], parts: Sequence[Shooting]) -> list[float]:
-    """Root mean squares of the outputs' errors over their spread, with the first states free, over several parts."""
+    """Root mean squares of the outputs' errors over their spread, with free initial states, over several parts."""
     squares = np.square([part.explained(thetas) for part in parts])
     return np.sqrt(np.average(squares, axis=0, weights=[part.windows.y.size for part in parts])).tolist()

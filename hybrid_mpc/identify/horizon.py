@@ -1,4 +1,4 @@
-"""The most likely trajectory of states and unknown rates over a stretch of samples: nonlinear least squares."""
+"""Most likely trajectory of states and unknown rates over a recording, by nonlinear least squares."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ Bools = NDArray[np.bool_]
 AT_ONCE = 256
 """Samples whose equations are evaluated together: arrays of this length stay in a processor's cache."""
 STEPS = 60
-"""Levenberg-Marquardt steps at most; a dozen is usual."""
+"""Maximum Levenberg-Marquardt steps; about a dozen are usual."""
 STILL = 1e-4
-"""A trajectory is found when a step would lower its cost by less than this, a sample on average: each estimate would
-move by about 1 % of its standard deviation."""
+"""Decrease of the cost per sample below which the iteration has converged: each estimate would change by about 1 % of
+its standard deviation."""
 DAMPED, MORE, LESS = 1.0, 30.0, 10.0
-"""Weight of the first damping (a step of one natural size costs 1), and its factors after a step that raised the cost
-and one that lowered it."""
+"""First damping (a step of one natural size costs 1), factor after a step that increased the cost, and divisor after a
+step that reduced it."""
 HELD = 1e15
-"""Damping at which nothing moves any more."""
+"""Damping at which the iteration ends."""
 PATIENCE = 4
-"""Steps that may pass without a lower cost before the last best estimate is returned to, with more damping: equations
-that hold almost exactly make costs rise beside them, and the next steps lead back onto them."""
+"""Steps without a lower cost before the iteration returns to the best estimate, with more damping. (Almost exact
+equations increase the cost of a step, and the next steps reduce it again.)"""
 HUBER = 4.0
-"""Standard deviations from which on a residual of the outputs counts by its size, no longer by its square: of 16,000
-that are normally distributed one."""
+"""Residual of an output, in standard deviations, above which its loss is linear instead of quadratic; one of 16,000
+normal residuals is larger."""
 SUSPECT = 1e3
-"""Mean square of the residuals from which on a trajectory is looked for from other starts too: 1 is what it should be,
-some hundreds what a wrong prior leaves, more where steps end beside the equations."""
+"""Mean square of the residuals above which the iteration is repeated from other starts. The expected value is 1; a
+wrong prior gives some hundreds; more means that the iteration did not reach the equations."""
 ELASTIC = (1e3, 30.0)
-"""Factors of the process noise on the way from another start: equations that give way let a trajectory pass from one
-branch to the other where a sensor tells states ambiguously (``|v|``, ``l sin q``)."""
+"""Factors on the process noise at first, after another start. With more process noise, a trajectory can pass from one
+branch to another if a sensor is ambiguous (``|v|``, ``l sin q``)."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class Stretches:
     """Samples of ``b`` trajectories, one behind the other.
 
     Args:
-        y: Measured outputs ``(n, n_y)``, NaN where nothing was measured.
-        censored: Which lie at an end of their sensor ``(n, n_y)``: +1 "at least", -1 "at most", else 0.
+        y: Measured outputs ``(n, n_y)``; NaN for a missing sample.
+        censored: +1 for a sample at the upper end of its sensor, -1 at the lower end, else 0, ``(n, n_y)``.
         u: Inputs ``(n, n_u)``.
         w: Disturbances ``(n, n_w)``.
-        begins: Places of the first samples ``(b,)``.
-        first: Expected ``(x, d)`` there ``(b, n_z)``.
+        begins: Indices of the first samples ``(b,)``.
+        first: Expected ``(x, d)`` at the first samples ``(b, n_z)``.
     """
 
     y: Array
@@ -66,7 +66,7 @@ class Stretches:
     first: Array
 
     def of(self, which: Bools) -> tuple[Stretches, Bools]:
-        """Some of the trajectories ``(b,)``, and which samples are theirs ``(n,)``."""
+        """Select trajectories by a mask ``(b,)``; also return the mask of their samples ``(n,)``."""
         lengths = np.diff([*self.begins, len(self.y)])
         own = np.repeat(which, lengths)
         begins = np.concatenate([[0], np.cumsum(lengths[which])[:-1]]).astype(np.intp)
@@ -76,27 +76,28 @@ class Stretches:
 
 @dataclass(frozen=True)
 class Horizon:
-    """Most likely ``z_k = (x_k, d_k)`` of all samples, by what is known of the first, the outputs and the equations.
+    """Most likely ``z_k = (x_k, d_k)`` of all samples of a recording, as in a moving horizon estimator.
 
-    ``V(z) = |z_0 - first|^2 / spread^2 + sum_k h((y_k - g(x_k, u_k, w_k)) / sigma) + sum_k |z_{k+1} - F(z_k)|^2 /
-    process^2`` with Huber's loss ``h``; ``F`` integrates the equations over a period with ``d_k`` held, which then
-    fades. It is minimised by Levenberg-Marquardt steps: the normal equations are block tridiagonal and solved by a
-    banded Cholesky factorization; a step that does not lower the cost is not taken, and states stay within bounds. So
-    no estimate can run away. It is the problem of a moving horizon estimator over a whole recording.
+    Minimum of ``V(z) = |z_0 - first|^2 / spread^2 + sum_k h((y_k - g(x_k, u_k, w_k)) / sigma)
+    + sum_k |z_{k+1} - F(z_k)|^2 / process^2`` with Huber's loss ``h``. ``F`` integrates the equations over a period
+    with constant ``d_k``, then ``d`` decays by ``fading``.
+
+    Levenberg-Marquardt steps: the normal equations are block tridiagonal and solved by a banded Cholesky factorization.
+    Steps that do not reduce the cost are rejected, and states stay within bounds, so an estimate cannot diverge.
 
     Args:
-        equations: The prior's.
-        corrected: Places of the states whose rates have an unknown ``d`` added.
+        equations: Equations of the prior.
+        corrected: Indices of the states whose rates have an unknown ``d`` added.
         p: Parameters ``(n_p,)``.
         dt: Period [s].
         substeps: Runge-Kutta sub-steps a period.
-        fading: What is left of ``d`` after a period [-].
+        fading: Decay factor of ``d`` in one period [-].
         sigma: Standard deviations of the sensors' noise ``(n_y,)``.
-        process: Those of what a period adds to ``z`` ``(n_z,)``, all positive.
-        spread: Those of what is known of the first ``z`` ``(n_z,)``.
+        process: Standard deviations of the process noise of ``z`` in one period ``(n_z,)``, all positive.
+        spread: Standard deviations of the initial ``z`` ``(n_z,)``.
         size: Natural sizes of ``z`` ``(n_z,)``.
-        lower: Bounds of ``z`` ``(n_z,)``.
-        upper: The same.
+        lower: Lower bounds of ``z`` ``(n_z,)``.
+        upper: Upper bounds of ``z`` ``(n_z,)``.
 
     Source: Rao, Rawlings, Mayne, *Constrained state estimation for nonlinear discrete-time systems* (2003); Bell, *The
     iterated Kalman smoother as a Gauss-Newton method* (1994); Sarkka, Svensson, *Levenberg-Marquardt and line-search
@@ -117,13 +118,13 @@ class Horizon:
     upper: Array
 
     def solve(self, stretches: Stretches, starts: Sequence[Array]) -> Array:
-        """Most likely ``z`` ``(n, n_z)``, from the start ``(n, n_z)`` that explains a trajectory best.
+        """Compute the most likely ``z`` ``(n, n_z)``, from the start ``(n, n_z)`` with the lowest cost.
 
-        Where the outputs are then not explained by what was assumed of their noise, the other starts are followed too,
-        and equations that give way at first; the best is taken.
+        If the residuals are then far above the assumed noise, the other starts are tried too, at first with more
+        process noise; the result with the lowest cost is used.
 
         Raises:
-            InputError: If the equations give no number at any start of a trajectory.
+            InputError: If the equations are not finite at any start of a trajectory.
         """
         starts = [np.clip(z, self.lower, self.upper) for z in starts]
         first = np.array([_Linearized.at(self, stretches, z, ELASTIC[-1]).cost for z in starts])
@@ -151,11 +152,11 @@ class Horizon:
         return z
 
     def costs(self, stretches: Stretches, z: Array) -> Array:
-        """``V`` of trajectories ``(n, n_z)``, each ``(b,)``; infinite where the equations give no number."""
+        """``V`` of each trajectory ``(b,)`` for ``z`` ``(n, n_z)``; infinite if the equations are not finite."""
         return _Linearized.at(self, stretches, z, 1.0).cost
 
     def _descend(self, stretches: Stretches, z: Array, factor: float) -> tuple[Array, Array]:
-        """Levenberg-Marquardt steps from ``z``, with the process noise times a factor, and the costs found."""
+        """Levenberg-Marquardt steps from ``z``, with a factor on the process noise; returns ``z`` and the costs."""
         best = _Linearized.at(self, stretches, z, factor)
         found, cost = z.copy(), best.cost.copy()
         left, own, now, damping = np.arange(len(cost)), stretches, best, np.zeros(len(cost))
@@ -201,7 +202,7 @@ class _Linearized:
 
     @classmethod
     def at(cls, horizon: Horizon, own: Stretches, z: Array, factor: float) -> _Linearized:
-        """Linearized along ``z`` ``(n, n_z)``, with the process noise times ``factor``."""
+        """Linearize along ``z`` ``(n, n_z)``, with the process noise times ``factor``."""
         n, n_z = z.shape
         with np.errstate(over="ignore", invalid="ignore"):
             ahead, a, shown, c = horizon_values(horizon, z, own.u, own.w)
@@ -238,7 +239,7 @@ class _Linearized:
         return cls(horizon, own.begins, z, cost, gradient, diagonal, below, ~out)
 
     def step(self, damping: Array) -> tuple[Array, Array]:
-        """Step ``(n, n_z)`` under a damping ``(b,)``, and what it promises to lower the costs by ``(b,)``."""
+        """Step ``(n, n_z)`` for a damping ``(b,)``, and the predicted decrease of the costs ``(b,)``."""
         n, n_z = self.gradient.shape
         lengths = np.diff([*self.begins, n])
         every = np.repeat(damping, lengths)
@@ -255,7 +256,7 @@ class _Linearized:
                     banded[i - j, :, j] = diagonal[:, i, j]
                 banded[n_z + i - j, :, j] = below[:, i, j]
         banded = banded.reshape(2 * n_z, -1)
-        scale = 1.0 / np.sqrt(banded[0])  # equilibrated: what is known well and badly side by side
+        scale = 1.0 / np.sqrt(banded[0])  # equilibrate: the diagonal spans many orders of magnitude
         for k in range(2 * n_z):
             banded[k, : n * n_z - k] *= scale[k:] * scale[: n * n_z - k]
         banded[0] += np.finfo(float).eps * 4 * n_z  # rounding may leave a pivot below zero
@@ -263,14 +264,14 @@ class _Linearized:
             found = solveh_banded(
                 banded, right.ravel() * scale, lower=True, overwrite_ab=True, check_finite=False
             )
-        except LinAlgError:  # rounding made it indefinite: no step, and more damping follows
+        except LinAlgError:  # indefinite by rounding: no step now, and more damping in the next one
             return np.full((n, n_z), np.nan), np.full(len(lengths), np.inf)
         step = (found * scale).reshape(n, n_z)
         gain = np.add.reduceat((step * right).sum(axis=1), self.begins)
         return step * self.horizon.size, gain
 
     def mixed(self, other: _Linearized, which: Bools) -> _Linearized:
-        """The same, with the trajectories of ``other`` that are asked for ``(b,)``."""
+        """Replace the trajectories of a mask ``(b,)`` by those of ``other``."""
         if which.all():
             return other
         lengths = np.diff([*self.begins, len(self.z)])
@@ -282,7 +283,7 @@ class _Linearized:
         return self._of(self.begins, np.where(which, other.cost, self.cost), *blocks)
 
     def of(self, which: Bools) -> _Linearized:
-        """That of some trajectories."""
+        """Select trajectories by a mask ``(b,)``."""
         lengths = np.diff([*self.begins, len(self.z)])
         begins = np.concatenate([[0], np.cumsum(lengths[which])[:-1]]).astype(np.intp)
         own = np.repeat(which, lengths)

@@ -13,20 +13,20 @@ from hybrid_mpc.identify.prior_result import Combination
 
 Array = NDArray[np.float64]
 UNTOLD = 1.0
-"""Standard error, in half ranges, from which on a combination of parameters counts as not told by the data."""
+"""Standard error, in half ranges, above which a combination of parameters counts as not identifiable."""
 CLUSTERS = 48
-"""Parts of the windows at least whose scatter tells the standard errors."""
+"""Minimum number of parts of the windows whose scatter gives the standard errors."""
 ROUNDED = 1e-11
 """Ratio of singular values of the slopes below which they are rounding errors."""
 ALIKE_WEIGHTS = 0.8
-"""Ratio of the weights from which on parameters of one unit are taken to add up, instead of to multiply."""
+"""Ratio of the smallest to the largest weight above which parameters of one unit form a sum instead of a product."""
 INVOLVED = 0.2
-"""Share of the largest from which on a parameter counts as a part of a combination."""
+"""Share of the largest weight above which a parameter is a part of a combination."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit to windows found: ``theta`` with its covariance, and what the windows do not tell."""
+    """Result of a fit to windows: ``theta``, its covariance, and the combinations that are not identifiable."""
 
     theta: Array
     covariance: Array
@@ -43,21 +43,22 @@ def covariance(
     taken: float,
     outputs: int,
 ) -> tuple[Array, tuple[Combination, ...]]:
-    """Covariance ``(k, k)`` of ``theta``, and the combinations of parameters that the windows do not identify.
+    """Covariance ``(k, k)`` of ``theta``, and the combinations of parameters that are not identifiable.
 
-    It follows from the scatter of the slopes of ``CLUSTERS`` parts of the windows at least, since errors within a
-    window are no white noise, and from what holds ``theta`` at the nominal values. It is at least that of white noise,
-    since so few parts estimate their scatter roughly, and at most that of a half range.
+    The covariance is the sandwich ``H^-1 M H^-1``: ``H`` is the information (with the pull towards the nominal values),
+    and ``M`` the scatter of the gradients over at least ``CLUSTERS`` parts of the windows, because errors within a
+    window are correlated. Few parts estimate ``M`` roughly, so variances are at least those for white noise. They are
+    at most those of a half range.
 
     Args:
         fit: Names, units and bounds of the parameters.
         theta: The fitted parameters ``(k,)``.
-        slopes: Slopes ``(n, m, k)`` of the errors by ``theta``, first states eliminated, over their scales, by the root
-            of their robust weights.
-        error: The errors ``(n, m)``, in the same way.
+        slopes: Jacobian ``(n, m, k)`` of the errors with respect to ``theta``, with initial states eliminated, over the
+            errors' scales, times the root of the robust weights.
+        error: The errors ``(n, m)``, scaled and weighted in the same way.
         falling: Derivative of the robust influence function over its weight ``(n, m)``.
-        counted: Number of errors that count.
-        taken: Degrees of freedom that the first states take.
+        counted: Number of counted errors.
+        taken: Degrees of freedom of the initial states.
         outputs: Number of outputs; ``m`` is a multiple of it.
 
     Source: Liang and Zeger, *Longitudinal data analysis using generalized linear models* (1986), of clusters; Huber
@@ -71,7 +72,9 @@ def covariance(
     _, values, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
     told = np.zeros(k)
     told[: len(values)] = np.where(values > ROUNDED * values[0], values, 0.0)
-    back = directions.T * half[:, None]  # theta from coordinates in which the information is diag(told^2)
+    back = (
+        directions.T * half[:, None]
+    )  # theta = back @ c, with coordinates c whose information is diag(told^2)
     scores = (slopes * error[..., None]).reshape(n, -1, outputs, k).sum(axis=2)
     parts = min(math.ceil(CLUSTERS / n), scores.shape[1])
     begins = np.arange(parts) * scores.shape[1] // parts
@@ -82,7 +85,7 @@ def covariance(
     inverse = 1.0 / (np.square(told) + LOOSE**-2)
     found = back @ ((middle + LOOSE**-2 * np.eye(k)) * np.outer(inverse, inverse)) @ back.T
     found = 0.5 * (found + found.T)
-    white = float(np.square(error).sum()) / max(left, 1.0)  # variance of errors that are white, weighed
+    white = float(np.square(error).sum()) / max(left, 1.0)  # variance of weighted errors if they were white
     least = np.square(back) @ (inverse * inverse * (white * np.square(told) + LOOSE**-2))
     short = np.sqrt(np.maximum(least / np.maximum(np.diag(found), 1e-300), 1.0))
     found = found * np.outer(short, short)
@@ -94,7 +97,7 @@ def covariance(
 
 
 def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Array) -> Combination:
-    """What the data do not tell along a direction [half ranges], and the best known combination of the same."""
+    """Parameters of an unidentifiable direction [half ranges], and the best known combination of these parameters."""
     among = np.flatnonzero(np.abs(direction) > INVOLVED * np.abs(direction).max())
     names = tuple(fit.names[i] for i in among)
     if len(among) == 1:
@@ -102,7 +105,7 @@ def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Arr
     sizes = fit.unit[among]
 
     def known(size: Array) -> tuple[Array, float]:
-        """Weights of the parameters, each over its size, and what they add up to is known to."""
+        """Weights of the parameters in the best known combination, and its standard error; parameters over ``size``."""
         own = covariance[np.ix_(among, among)] * np.outer(sizes, sizes) / np.outer(size, size)
         values, directions = np.linalg.eigh(own)
         weights = directions[:, 0] / size
@@ -123,7 +126,7 @@ def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Arr
 
 
 def standard_errors(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
-    """Standard errors of the parameters that the data tell of."""
+    """Standard errors of the fitted parameters."""
     if not len(chosen.covariance):
         return {}
     sizes = np.sqrt(np.maximum(np.diag(chosen.covariance), 0.0)) * fit.unit
@@ -131,7 +134,7 @@ def standard_errors(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
 
 
 def correlations(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
-    """Correlation of the errors of every two parameters that the data tell of, by ``"a, b"``."""
+    """Correlation of the errors of every two fitted parameters, by ``"a, b"``."""
     c = chosen.covariance
     sigma = np.sqrt(np.maximum(np.diag(c), 1e-300)) if len(c) else np.zeros(0)
     told = [i for i in range(min(len(c), len(fit.free))) if math.isfinite(sigma[i])]

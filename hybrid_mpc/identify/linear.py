@@ -1,4 +1,4 @@
-"""Linear models from recordings, the baselines to ask for first: ARX and subspace (N4SID, CVA). No torch in here."""
+"""Linear models from recordings, as baselines: ARX and subspace (N4SID, CVA). No torch in here."""
 
 from __future__ import annotations
 
@@ -18,39 +18,39 @@ from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
 RANK = 1e-6
-"""Singular values below this share of the largest count as zero: what rounding of a file leaves."""
+"""Share of the largest singular value below which a value counts as zero: rounding of a file."""
 Weighting: TypeAlias = Literal["cva", "n4sid"]
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 25, 32)
-"""Orders that are tried where nobody says which: lags of an ARX model, states of a subspace model."""
+"""Default orders to try: lags of an ARX model, states of a subspace model."""
 MOST_STATES = 16
-"""Largest of ``ORDERS`` that a subspace model tries."""
+"""Largest of ``ORDERS`` for a subspace model."""
 DELAYS = (1, 2, 3, 4, 6, 8, 12, 16)
-"""Input delays [samples] that an ARX model tries where nobody says which; 1 is none beyond the sampling."""
+"""Default input delays [samples] of an ARX model; 1 is no delay besides the sampling."""
 DELAYED = 0.1
-"""Longest of ``DELAYS`` that is tried, over the longest recording."""
+"""Largest delay over the length of the longest recording."""
 HORIZONS = (5, 10, 20, 40)
-"""Samples of past, and as many of future, that a subspace model tries where nobody says which."""
+"""Default numbers of past samples, and of future samples, of a subspace model."""
 ROWS = 3
-"""Fewest equations per unknown of a candidate: with fewer it fits the noise and costs time."""
+"""Minimum number of equations per unknown of a candidate; with fewer, a candidate fits the noise."""
 STABLE = 1 + 1e-9
-"""Largest spectral radius that counts as stable; an exact integrator is 1 with rounding."""
+"""Largest spectral radius that counts as stable: 1 for an exact integrator, with rounding."""
 ALIKE = 1.01
-"""Errors of free runs within this factor count as the same, and the smaller order is taken."""
+"""Ratio of free-run errors up to which two candidates count as equal; the smaller order is then used."""
 ROUNDING = 1e-7
-"""Errors of free runs, over a signal's spread, below which two candidates count as the same: data without noise. A
-regression on normal equations keeps half the digits, 1e-8, and a free run adds them up."""
+"""Free-run error, over a signal's spread, below which two candidates count as equal (data without noise). A regression
+on normal equations has errors of about 1e-8, which accumulate in a free run."""
 SMALLEST = 1e-20
-"""Least variance of noise, over a signal's variance: what rounding leaves of data without noise."""
+"""Minimum variance of noise over a signal's variance: rounding in data without noise."""
 ROUNDED = 1e-12
-"""Least variance of noise in any direction, over the sum of its variances: rounding in a covariance."""
+"""Minimum variance of noise in any direction over the sum of the variances: rounding in a covariance."""
 LOST = 1e-10
-"""Directions of the past, and of the future, whose size over the largest is below this are rounding."""
+"""Share of the largest singular value of past or future below which a direction is rounding."""
 BLOCK = 20_000
-"""Rows that are factorised at once, and samples of the longest free run that B is fitted to."""
+"""Rows that are factorized together, and maximum samples of a free run for the fit of B."""
 
 
 class Measured(Protocol):
-    """A recording on a uniform grid; measured disturbances ``w`` ``(n, n_w)``, where it has them, join its inputs."""
+    """A recording on a uniform grid; measured disturbances ``w`` ``(n, n_w)``, if any, are appended to the inputs."""
 
     @property
     def y(self) -> Array:
@@ -63,14 +63,14 @@ class Measured(Protocol):
 
 @dataclass(frozen=True)
 class Candidate:
-    """What was tried: the root mean square error of its free runs over each output's spread, and its stability.
+    """A candidate model: its orders, its free-run error and its stability.
 
     Args:
         order: Lags of an ARX model, states of a subspace model.
-        delay: Input delay [samples] of an ARX model; of a subspace model 0.
-        horizon: Samples of past and of future of a subspace model; of an ARX model 0.
-        error: Error of the free runs on the validation recordings, 1 is about that of a constant mean; infinite where
-            a run diverges, or the model has no predictor that starts it.
+        delay: Input delay [samples] of an ARX model; 0 for a subspace model.
+        horizon: Past samples, and future samples, of a subspace model; 0 for an ARX model.
+        error: Root mean square error of free runs on the validation recordings, over each output's spread; about 1 for
+            a constant mean. Infinite if a run diverges, or the model has no one-step predictor for its initial state.
         radius: Largest absolute eigenvalue.
     """
 
@@ -82,12 +82,12 @@ class Candidate:
 
     @property
     def stable(self) -> bool:
-        """No eigenvalue outside the unit circle but for rounding."""
+        """Whether no eigenvalue lies outside the unit circle, up to rounding."""
         return self.radius <= STABLE
 
     @property
     def text(self) -> str:
-        """What it has of order, delay and horizon, in words: ``"order 2, delay 1"``."""
+        """Order, delay and horizon as text: ``"order 2, delay 1"``."""
         own = {"order": self.order, "delay": self.delay, "horizon": self.horizon}
         return ", ".join(f"{key} {value}" for key, value in own.items() if value)
 
@@ -105,18 +105,18 @@ class LinearModel:
         A: ``(n_x, n_x)``.
         B: ``(n_x, n_u)``.
         C: ``(n_y, n_x)``.
-        D: ``(n_y, n_u)``; zero unless a direct path was asked for.
-        K: Gain of the one-step predictor ``(n_x, n_y)``; that of an ARX model forgets all but its lags.
-        bias: ``(n_x,)``: the recordings' mean is no equilibrium.
+        D: ``(n_y, n_u)``; zero unless a direct path was requested.
+        K: Gain of the one-step predictor ``(n_x, n_y)``; that of an ARX model has no memory beyond its lags.
+        bias: ``(n_x,)``; the mean of the recordings need not be an equilibrium.
         noise: Covariance of e ``(n_y, n_y)``.
-        spread: Covariance of x over the training recordings ``(n_x, n_x)``: where a free run may start.
+        spread: Covariance of x over the training recordings ``(n_x, n_x)``, for the initial state of a free run.
         u_centre: Means of the inputs ``(n_u,)`` over the training recordings.
-        u_scale: Their standard deviations.
+        u_scale: Standard deviations of the inputs ``(n_u,)``.
         y_centre: Means of the outputs ``(n_y,)``.
-        y_scale: Their standard deviations.
-        chosen: The candidate that this model is.
-        candidates: All that were tried.
-        warnings: What is doubtful. Default: nothing.
+        y_scale: Standard deviations of the outputs ``(n_y,)``.
+        chosen: The candidate of this model.
+        candidates: All candidates that were tried.
+        warnings: Warnings about the recordings or the model. Default: none.
     """
 
     name: str
@@ -143,11 +143,11 @@ class LinearModel:
         return np.asarray(np.linalg.eigvals(self.A), dtype=complex)
 
     def free_run(self, y_past: Array, u: Array) -> Array:
-        """Outputs that the model predicts from its inputs alone after a measured warm-up; all windows at once.
+        """Compute free runs from the inputs alone after a measured warm-up; all windows at once.
 
-        The state after the warm-up is the most likely one: the predictor runs over the warm-up, and its start is
-        found by least squares on its one-step errors, with ``spread`` as what is known before. For an ARX model whose
-        warm-up holds its lags, it is these lags.
+        The state after the warm-up is the most likely one: the predictor runs over the warm-up, and its initial state
+        minimizes the one-step errors, with ``spread`` as prior covariance. For an ARX model whose warm-up holds its
+        lags, the state is these lags.
 
         Args:
             y_past: Outputs measured in the warm-up ``(..., warm, n_y)``; NaN where a sample is missing.
@@ -193,7 +193,7 @@ class LinearModel:
         return np.asarray((x @ self.C.T + v @ self.D.T) * self.y_scale + self.y_centre)
 
     def free_runs(self, recordings: Sequence[Measured], warm: int) -> list[Array]:
-        """:meth:`free_run` of recordings that may differ in length: their first ``warm`` samples are given.
+        """:meth:`free_run` of recordings that may differ in length; their first ``warm`` samples are the warm-up.
 
         Args:
             recordings: The recordings.
@@ -262,27 +262,27 @@ def fit_arx(
     orders: Sequence[int] | None = None,
     delays: Sequence[int] | None = None,
 ) -> LinearModel:
-    """The ARX model ``y_k = sum A_i y_(k-i) + sum B_j u_(k-d-j) + c + e_k`` whose free runs are best.
+    """Fit ARX models ``y_k = sum A_i y_(k-i) + sum B_j u_(k-d-j) + c + e_k`` and select by free runs.
 
-    Each candidate is fitted by least squares on one step; as many lags of u as of y. The one that runs freely over the
-    validation recordings with the least error is taken, stable ones before others.
+    Each candidate is fitted by least squares on one-step errors, with as many lags of u as of y. The stable candidate
+    with the least free-run error on the validation recordings is used; an unstable one only if no candidate is stable.
 
     Args:
-        train: Recordings to fit on, of any lengths.
-        valid: Recordings to choose the order on.
+        train: Training recordings, of any lengths.
+        valid: Validation recordings, which select the order.
         dt: Period [s].
-        warm: Samples of each validation recording that are given before its free run.
+        warm: Samples of the warm-up of each validation recording.
         orders: Numbers of lags to try. Default: those of ``ORDERS`` for which the recordings have three equations
             per unknown.
         delays: Input delays d [samples] to try; 0 is a direct path. Default: those of ``DELAYS`` up to a tenth of the
             longest recording.
 
     Returns:
-        The model; its state are its lags.
+        The model; its state consists of its lags.
 
     Raises:
-        InputError: If recordings are too short, have different numbers of columns, an input or an output never
-            changes, an input is not finite, or a number makes no sense.
+        InputError: If recordings are too short or have different numbers of columns, an input or an output is constant,
+            an input is not finite, or an argument is out of range.
 
     Source: Ljung, *System Identification*, 2nd edition, 1999, sections 4.2 and 10.1.
 
@@ -336,23 +336,22 @@ def fit_subspace(
     weighting: Weighting = "cva",
     direct: bool = False,
 ) -> LinearModel:
-    """The state-space model by a subspace method whose free runs are best.
+    """Fit state-space models by a subspace method and select by free runs.
 
-    A and C come from the shift of the extended observability matrix; B, D and the bias, with a free initial state for
-    each recording, from the error of its free run over the training recordings; K from the Riccati equation of the
-    residuals. Windows that touch a missing sample are left out. Recordings in closed loop, whose inputs were made of
-    the outputs, bias A.
+    A and C follow from the shift of the extended observability matrix. B, D and the bias minimize the free-run error
+    over the training recordings, with a free initial state for each recording. K solves the Riccati equation of the
+    residuals. Windows with a missing sample are left out. Recordings in closed loop bias A.
 
     Args:
-        train: Recordings to fit on, of any lengths.
-        valid: Recordings to choose order and horizon on.
+        train: Training recordings, of any lengths.
+        valid: Validation recordings, which select order and horizon.
         dt: Period [s].
-        warm: Samples of each validation recording that are given before its free run.
+        warm: Samples of the warm-up of each validation recording.
         orders: Numbers of states to try. Default: ``ORDERS`` up to 16.
-        horizons: Samples of past, and of future, to try. Default: those of ``HORIZONS`` for which the recordings have
-            three windows per unknown.
-        weighting: ``"cva"``, canonical variates, or ``"n4sid"``. Default: ``"cva"``.
-        direct: With a direct path D. Default: none, an input acts from the next sample on.
+        horizons: Numbers of past samples, and of future samples, to try. Default: those of ``HORIZONS`` for which the
+            recordings have three windows per unknown.
+        weighting: ``"cva"`` (canonical variates) or ``"n4sid"``. Default: ``"cva"``.
+        direct: True: with a direct path D. Default: False; an input acts from the next sample on.
 
     Returns:
         The model.
@@ -362,8 +361,6 @@ def fit_subspace(
 
     Source: Van Overschee and De Moor, *Subspace Identification for Linear Systems*, 1996, chapter 4 and its table of
     weightings; Larimore, *Canonical variate analysis in identification, filtering, and adaptive control*, CDC 1990.
-    The packages on PyPI take one recording each (nfoursid 1.0, sippy_unipi 1.0) and bring plotting or symbolic
-    libraries along.
 
     Example:
         >>> from types import SimpleNamespace
@@ -405,7 +402,7 @@ def fit_subspace(
 
 @dataclass(frozen=True)
 class _Data:
-    """Training recordings ``(y, u)``, centred and scaled; ``still`` are inputs that never change."""
+    """Training recordings ``(y, u)``, centred and scaled; ``still`` are the indices of constant inputs."""
 
     runs: tuple[tuple[Array, Array], ...]
     u_centre: Array
@@ -436,7 +433,7 @@ def _signals(recording: Measured) -> tuple[Array, Array]:
 
 
 def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, warm: int) -> _Data:
-    """The scaled training data; the error lists all problems of the input together."""
+    """Check and scale the training data; the error lists all problems together."""
     problems = []
     if not positive(dt):
         problems.append(f"dt: got {dt!r:.80}; give a period above 0 s [HM-IDENTIFY-027]")
@@ -505,7 +502,7 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
 
 
 def _naturals(given: Sequence[int] | None, default: Sequence[int], name: str, least: int) -> list[int]:
-    """Distinct whole numbers in rising order."""
+    """Check whole numbers; return them sorted, without duplicates."""
     values = list(default if given is None else given)
     if not values or any(
         isinstance(v, bool) or not isinstance(v, int | np.integer) or v < least for v in values
@@ -518,7 +515,7 @@ def _naturals(given: Sequence[int] | None, default: Sequence[int], name: str, le
 
 
 def _windows(data: _Data, length: int) -> int:
-    """How many runs of so many samples, none of them missing, there are; they may overlap."""
+    """Number of windows of ``length`` samples without a missing sample; windows may overlap."""
     return sum(
         int(sliding_window_view(np.isfinite(y).all(axis=1), length).all(axis=1).sum())
         for y, _ in data.runs
@@ -527,7 +524,7 @@ def _windows(data: _Data, length: int) -> int:
 
 
 def _long_enough(enough: Sequence[int], short: Sequence[str], default: bool, data: _Data) -> None:
-    """An error where no candidate has data enough, or one that was asked for has not."""
+    """Raise an error if no candidate, or not every requested candidate, has enough data."""
     if enough and (default or not short):
         return
     lengths = ", ".join(str(len(y)) for y, _ in data.runs[:5]) + (", ..." if len(data.runs) > 5 else "")
@@ -539,7 +536,7 @@ def _long_enough(enough: Sequence[int], short: Sequence[str], default: bool, dat
 
 
 def _triangle(blocks: Iterable[Array]) -> tuple[Array, int]:
-    """R of a QR factorisation of the rows of all blocks without those that hold a NaN, and their number."""
+    """R of a QR factorization of all rows without NaN, and the number of these rows."""
     r: Array | None = None
     rows = 0
     for block in blocks:
@@ -553,7 +550,7 @@ def _triangle(blocks: Iterable[Array]) -> tuple[Array, int]:
 
 
 def _arx(data: _Data, dt: float, order: int, delays: Sequence[int]) -> Iterator[LinearModel]:
-    """ARX models of one order and several delays, from one factorisation."""
+    """ARX models of one order and several delays, from one factorization."""
     n_y, n_u = data.n_y, data.n_u
     first, last = min(1, *delays), max(order, order + max(delays) - 1)
 
@@ -575,7 +572,7 @@ def _arx(data: _Data, dt: float, order: int, delays: Sequence[int]) -> Iterator[
         residual = r[:, -n_y:] - r[:, columns] @ theta
         weights = np.zeros((r.shape[1], n_y))
         weights[columns] = theta
-        # observer form: block i of the state is what the past adds to y in i - 1 samples; A - K C shifts
+        # observer form: block i of the state is the past's contribution to y after i - 1 samples; A - K C is a shift
         blocks = max(order, delay + order - 1)
         by_y = np.zeros((blocks, n_y, n_y))
         by_u = np.zeros((blocks + 1, n_y, n_u))
@@ -602,7 +599,7 @@ def _arx(data: _Data, dt: float, order: int, delays: Sequence[int]) -> Iterator[
 def _subspace(
     data: _Data, dt: float, horizon: int, orders: Sequence[int], weighting: Weighting, direct: bool
 ) -> Iterator[LinearModel | Candidate]:
-    """Subspace models of one horizon and several orders, from one factorisation."""
+    """Subspace models of one horizon and several orders, from one factorization."""
     n_y, n_u, i = data.n_y, data.n_u, horizon
 
     def rows() -> Iterator[Array]:
@@ -619,7 +616,7 @@ def _subspace(
     u_f, u_p, y_p, y_f = np.split(1 + np.arange(r.shape[1] - 1), np.cumsum([i * n_u, i * n_u, i * n_y]))
     past = np.concatenate([u_p, y_p])
     later = np.concatenate([u_p[n_u:], u_f[:n_u], y_p[n_y:], y_f[:n_y]])  # the past one sample on
-    # what the past says of the future beyond the future's inputs; directions of the past that are rounding say nothing
+    # regression of the future outputs on the past, with the future inputs projected out; rounding directions dropped
     left, size, right = np.linalg.svd(r[np.ix_(past, past)])
     keep = size > LOST * size[0]
     of_past = right[keep].T @ ((left[:, keep].T @ r[np.ix_(past, y_f)]) / size[keep, None])
@@ -644,11 +641,11 @@ def _subspace(
         x, x_next = r[:, past] @ to_state, r[:, later] @ to_state
         if _radius(a) <= STABLE:
             b, d, bias = _inputs_by_free_run(data, a, c, direct)
-        else:  # its free runs say nothing
+        else:  # free runs diverge, so B and D follow from one-step residuals
             known = np.hstack([inputs, ones])
             b_bias = np.linalg.lstsq(known, x_next - x @ a.T, rcond=None)[0].T
             d_rest = np.linalg.lstsq(known[:, 0 if direct else n_u :], outputs - x @ c.T, rcond=None)[0].T
-            # of the state, so that the output needs no bias
+            # shift of the state, so that the output needs no bias
             shift = np.linalg.lstsq(c, d_rest[:, -1], rcond=None)[0]
             b, bias = b_bias[:, :n_u], b_bias[:, n_u] + shift - a @ shift
             d = d_rest[:, :-1] if direct else np.zeros((n_y, n_u))
@@ -656,7 +653,7 @@ def _subspace(
         covariance, state = residual.T @ residual, x[1:].T @ x[1:]
         try:
             k, noise = _gain(a, c, covariance, float(np.trace(state)) / n)
-        except InputError:  # of an A far from stable; the table of candidates says so
+        except InputError:  # A is far from stable; the table of candidates shows its radius
             yield Candidate(n, 0, horizon, math.inf, _radius(a))
             continue
         yield _model(
@@ -666,10 +663,10 @@ def _subspace(
 
 
 def _inputs_by_free_run(data: _Data, a: Array, c: Array, direct: bool) -> tuple[Array, Array, Array]:
-    """B, D and bias with the least error of free runs over the training data, each from an initial state of its own.
+    """B, D and bias that minimize the free-run error over the training data, with a free initial state for each run.
 
-    A long recording is several runs. How output j answers an input that enters state a is state a of the transposed
-    system, driven through row j of C.
+    A long recording is several runs. The response of output j to an input that enters state i is state i of the
+    transposed system, driven through row j of C.
     """
     n, n_y, n_u = len(a), data.n_y, data.n_u
 
@@ -696,12 +693,10 @@ def _inputs_by_free_run(data: _Data, a: Array, c: Array, direct: bool) -> tuple[
 
 
 def _gain(a: Array, c: Array, covariance: Array, size: float) -> tuple[Array, Array]:
-    """Gain of the one-step predictor and covariance of its errors, from that of the residuals ``[x+; y]``."""
+    """Gain of the one-step predictor and covariance of its errors, from the covariance of the residuals ``[x+; y]``."""
     n = len(a)
     r = _positive(covariance[n:, n:], 1.0)
-    by_y = np.linalg.solve(
-        r, covariance[n:, :n]
-    ).T  # the part of the state's noise that the output's noise tells
+    by_y = np.linalg.solve(r, covariance[n:, :n]).T  # regression of the state's noise on the output's noise
     q = _positive(covariance[:n, :n] - by_y @ covariance[n:, :n], size)
     unit = float(np.trace(r))
     p, gain = dare((a - by_y @ c).T, c.T, q / unit, r / unit)
@@ -709,7 +704,7 @@ def _gain(a: Array, c: Array, covariance: Array, size: float) -> tuple[Array, Ar
 
 
 def _positive(covariance: Array, size: float) -> Array:
-    """A covariance with no direction below what rounding leaves; ``size`` is the signal's own variance."""
+    """Raise the eigenvalues of a covariance to rounding level; ``size`` is the signal's own variance."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     least = SMALLEST * size + ROUNDED * float(np.abs(values).sum())
     return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
@@ -718,8 +713,8 @@ def _positive(covariance: Array, size: float) -> Array:
 def _states(a: Array, v: Array, x0: Array) -> Array:
     """States ``(..., n, n_x)`` of ``x_(k+1) = A x_k + v_k`` from ``x0`` ``(..., n_x)``, all samples at once.
 
-    In the basis of A's Schur form each state is a filter of first order over the ones after it; that basis is unitary,
-    so nothing is lost where eigenvalues coincide.
+    In the basis of A's Schur form, each state is a first-order filter driven by the states after it. The basis is
+    unitary, so equal eigenvalues cause no loss of accuracy.
     """
     from scipy.linalg import schur
     from scipy.signal import lfilter
@@ -745,7 +740,7 @@ def _root(covariance: Array) -> Array:
 
 
 def _doubts(data: _Data, inputs: Array, what: str) -> tuple[str, ...]:
-    """What the training recordings do not say, from the R factor of their lagged inputs."""
+    """Warnings about insufficient excitation, from the R factor of the lagged inputs."""
     doubts = [
         f"measured disturbance (input {j + 1}) never changes in the training recordings: the model does not know it"
         for j in data.still
@@ -786,7 +781,7 @@ def _model(
 
 
 def _error(model: LinearModel, recordings: Sequence[Measured], warm: int) -> float:
-    """Root mean square error of free runs over each output's spread; infinite where they diverge."""
+    """Root mean square error of free runs over each output's spread; infinite if a run diverges."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable candidate
         errors = np.concatenate([
             (y_hat - _signals(r)[0][warm:]) / model.y_scale
@@ -798,7 +793,7 @@ def _error(model: LinearModel, recordings: Sequence[Measured], warm: int) -> flo
 
 
 def _best(tried: Iterable[LinearModel | Candidate], valid: Sequence[Measured], warm: int) -> LinearModel:
-    """The stable model whose free runs over the validation recordings are best; of alike ones the smallest."""
+    """Select the stable model with the least free-run error on validation recordings; of equal ones the smallest."""
     candidates, models = [], []
     for one in tried:
         if isinstance(one, LinearModel):
@@ -822,4 +817,4 @@ def _best(tried: Iterable[LinearModel | Candidate], valid: Sequence[Measured], w
 
 
 BASELINES: Mapping[str, Callable[..., LinearModel]] = {"ARX": fit_arx, "N4SID": fit_subspace}
-"""Linear models of inputs and outputs by name, which practitioners ask for first."""
+"""Linear input-output models by name."""

@@ -1,6 +1,6 @@
-"""The GRU that corrects a prior: one network as it is exported, and several stacked for training.
+"""The GRU that corrects a prior: a single network for export, and a stack of networks for training.
 
-All are ``(s, h) -> (output, h_next)``; the hidden state h is an explicit vector.
+Both are functions ``(s, h) -> (output, h_next)`` with an explicit hidden state h.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from torch import Tensor, nn
 
 
 class GRUNetwork(nn.Module):
-    """One GRU layer and one linear layer, as it is exported.
+    """One GRU layer and one linear layer, for export.
 
-    The gates are torch's form of the paper's GRU (the sign of z turned, one more bias).
+    ``r = sig(W_r s + b_ir + R_r h + b_hr)``, ``z = sig(W_z s + b_iz + R_z h + b_hz)``,
+    ``n = tanh(W_n s + b_in + r (R_n h + b_hn))``, ``h+ = (1 - z) n + z h``: torch's form of the paper's GRU (z with the
+    opposite sign, and one more bias).
 
     Args:
         n_in: Number of input features.
@@ -43,11 +45,11 @@ class GRUNetwork(nn.Module):
 
 
 class StackedGRU(nn.Module):
-    """``networks`` independent :class:`GRUNetwork` with stacked weights, trained at once.
+    """Several independent :class:`GRUNetwork` with stacked weights, trained at once.
 
-    Tensors carry the network as first axis, ``(networks, batch, features)``. Small networks are bound by the cost of
-    launching operations, so several cost little more than one. Network i of one ``seed`` is the same whatever
-    ``networks`` is; ``zero_head`` starts with zero output.
+    The first axis of a tensor is the network, ``(networks, batch, features)``. The time of small networks is that of
+    launching operations, so several networks cost little more than one. Network i depends on ``seed`` but not on the
+    number of ``networks``. ``zero_head``: True: the initial output is zero.
     """
 
     def __init__(
@@ -78,7 +80,7 @@ class StackedGRU(nn.Module):
 
     @classmethod
     def of(cls, network: GRUNetwork) -> StackedGRU:
-        """A stack of one network, with copies of its weights."""
+        """Create a stack of one network, with copies of its weights."""
         cell, head = network.cell, network.head
         stack = cls(1, cell.input_size, network.n_h, head.out_features, seed=0)
         weights = cell.weight_ih.T, cell.weight_hh.T, cell.bias_ih, cell.bias_hh, head.weight.T, head.bias
@@ -97,7 +99,7 @@ class StackedGRU(nn.Module):
         return torch.baddbmm(self.b_out, h_next, self.w_out), h_next
 
     def sequence(self, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs ``(T, networks, batch, n_out)`` and last h along a sequence.
+        """Outputs ``(T, networks, batch, n_out)`` and the last h along a sequence.
 
         Features ``s`` are ``(T, networks, batch, n_in)``, or ``(T, 1, batch, n_in)`` if all networks have the same.
         """
@@ -106,20 +108,20 @@ class StackedGRU(nn.Module):
         return out.transpose(0, 1), states[:, -1]
 
     def member(self, i: int) -> GRUNetwork:
-        """Network ``i`` alone, with the same weights."""
+        """Extract network ``i``."""
         network = GRUNetwork(self.n_in, self.n_h, self.n_out)
         cell = {"weight_ih": self.w_ih, "weight_hh": self.w_hh, "bias_ih": self.b_ih, "bias_hh": self.b_hh}
         stacked = {f"cell.{name}": weight for name, weight in cell.items()}
         stacked |= {"head.weight": self.w_out, "head.bias": self.b_out}
-        # a row of biases is a matrix (1, n) here and a vector there
+        # biases are matrices (1, n) in the stack and vectors in the single network
         network.load_state_dict({n: w[i].T if "weight" in n else w[i, 0] for n, w in stacked.items()})
         return network
 
     def joined(self, shares: Sequence[float]) -> GRUNetwork:
-        """All networks as one, whose output is a mean of theirs; its hidden state is theirs, one after the other.
+        """Join all networks to one whose output is their weighted mean.
 
-        Its recurrent weights are block-diagonal: the networks do not see each other. ``shares`` ``(networks,)`` of the
-        mean sum up to one.
+        The hidden state consists of the networks' hidden states, one after the other. The recurrent weights are
+        block-diagonal, so the networks do not interact. ``shares`` ``(networks,)`` are the weights; their sum is one.
 
         Example:
             >>> stack = StackedGRU(2, 3, 4, 1, seed=0).requires_grad_(False)
@@ -133,11 +135,11 @@ class StackedGRU(nn.Module):
         network = GRUNetwork(self.n_in, m * z, self.n_out)
 
         def rows(weight: Tensor) -> Tensor:
-            """Gates of each network ``(m, n, 3 z)`` as gates of all, each gate whole ``(3 m z, n)``."""
+            """Reorder the gates of each network ``(m, n, 3 z)``, so that each gate of all networks is one block."""
             return weight.mT.unflatten(1, (3, z)).transpose(0, 1).reshape(3 * m * z, -1)
 
         share = torch.tensor(shares, dtype=torch.float64)[:, None, None]
-        of = torch.arange(m).repeat_interleave(z)  # which network a unit is of
+        of = torch.arange(m).repeat_interleave(z)  # network of each unit
         recurrent = rows(self.w_hh).repeat(1, m) * (of.repeat(3)[:, None] == of)
         network.load_state_dict(
             {
@@ -161,13 +163,13 @@ class StackedGRU(nn.Module):
 
 
 def hidden_states(s: Tensor, h: Tensor, w_ih: Tensor, w_hh: Tensor, b_ih: Tensor, b_hh: Tensor) -> Tensor:
-    """Hidden states ``(networks, T, batch, z)`` along a sequence; differentiable once by every argument.
+    """Hidden states ``(networks, T, batch, z)`` along a sequence; differentiable once with respect to every argument.
 
-    The equations of :class:`StackedGRU` with a derivative written by hand. A time step is one matrix product (hidden
-    state, features and bias in one row) and four operations on the gates, in memory that is allocated once. Automatic
-    differentiation would record a dozen operations a step. Sums run in another order, so results differ by rounding.
-    ``s`` is ``(T, networks or 1, batch, n_in)``, h ``(networks, batch, z)``; the columns of the weights are the gates
-    r, z and the candidate.
+    The equations of :class:`StackedGRU` with a hand-written derivative. A time step is one matrix product (hidden
+    state, features and bias in one row) and four operations on the gates, in preallocated memory. Automatic
+    differentiation would record about a dozen operations for each step. Sums have another order, so results differ by
+    rounding. ``s`` is ``(T, networks or 1, batch, n_in)``, h ``(networks, batch, z)``; the columns of the weights are
+    the gates r, z and the candidate.
     """
     rows = torch.cat([s, s.new_ones(*s.shape[:3], 1)], dim=3).transpose(0, 1)
     states: Tensor = _States.apply(rows, h, *gate_matrices(w_ih, w_hh, b_ih, b_hh))
@@ -175,8 +177,11 @@ def hidden_states(s: Tensor, h: Tensor, w_ih: Tensor, w_hh: Tensor, b_ih: Tensor
 
 
 def gate_matrices(w_ih: Tensor, w_hh: Tensor, b_ih: Tensor, b_hh: Tensor) -> tuple[Tensor, Tensor]:
-    """A time step as two products: ``[h, s, 1]`` to the gates r, z and what is inside the reset product
-    ``(networks, z + n_in + 1, 3 z)``, and ``[s, 1]`` to what is added to that ``(networks, n_in + 1, z)``.
+    """Matrices of a time step as two products.
+
+    Returns:
+        ``(networks, z + n_in + 1, 3 z)`` from ``[h, s, 1]`` to the sums of r and z and to the factor of r in the
+        candidate, and ``(networks, n_in + 1, z)`` from ``[s, 1]`` to the rest of the candidate's sum.
     """
     z = w_hh.shape[1]
     gate = torch.cat([w_ih[..., : 2 * z], (b_ih + b_hh)[..., : 2 * z]], dim=1)
@@ -186,9 +191,9 @@ def gate_matrices(w_ih: Tensor, w_hh: Tensor, b_ih: Tensor, b_hh: Tensor) -> tup
 
 
 class _States(torch.autograd.Function):
-    """``h`` of all times from rows ``[s, 1]``; a row in memory is ``[h, s, 1]`` of one time.
+    """``h`` of all time steps from rows ``[s, 1]``; a row in memory is ``[h, s, 1]`` of one time step.
 
-    The network is the first axis and time the second: what is done for all times is one product a network.
+    The network is the first axis and time the second, so operations on all time steps are one product per network.
     """
 
     @staticmethod
@@ -198,7 +203,7 @@ class _States(torch.autograd.Function):
         x = s.new_empty(networks, steps + 1, batch, z + s.shape[3])
         x[:, 0, :, :z] = h
         x[:, :-1, :, z:] = s
-        # r, z, and R_n h + b inside the reset product; time first, since products are written into whole memory
+        # r, z, and R_n h + b_hn; time is the first axis, because products are written to contiguous memory
         gates = s.new_empty(steps, networks, batch, 3 * z)
         rows = s.flatten(1, 2).expand(networks, -1, -1)
         candidate = torch.bmm(rows, direct).unflatten(1, (steps, batch))
@@ -235,7 +240,10 @@ class _States(torch.autograd.Function):
 def step_back(
     grad: Tensor, carry: Tensor, dh: Tensor, h: Tensor, g: Tensor, n: Tensor, d: Tensor, d_n: Tensor
 ) -> None:
-    """Derivatives by the gates' sums ``d`` and the candidate's ``d_n``, and what h itself hands on, ``carry``."""
+    """Backward pass of one step: derivatives by the gates' sums ``d`` and the candidate's sum ``d_n``, and ``carry``.
+
+    ``carry`` is the part of the derivative that reaches the previous h directly: ``z dh``.
+    """
     z, aten = n.shape[-1], torch.ops.aten
     torch.add(grad, carry, out=dh)
     torch.mul(dh, g[..., z : 2 * z], out=carry)

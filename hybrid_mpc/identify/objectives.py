@@ -1,7 +1,7 @@
-"""Objectives of the training, the predictions they are taken of, and how several become one number.
+"""Objectives of the training, the predictions that they evaluate, and the combination of several objectives.
 
-An objective is a function of one period from every measured state (:func:`teacher_forced`) or of the model's own free
-run (:func:`free_run`).
+An objective evaluates one-step predictions from measured states (:func:`teacher_forced`) or a free run
+(:func:`free_run`).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from hybrid_mpc.machine.prior import Prior
 
 
 class VectorPerformanceIndex:
-    """Several objectives L_j as one number, with bounds c_j that only fall (Kreisselmeier & Steinhauser 1979).
+    """Combination of several objectives L_j with bounds c_j that never rise (Kreisselmeier & Steinhauser 1979).
 
-    :meth:`value`, a smooth maximum of L_j / c_j, is minimised on mini-batches. :meth:`lower` takes the objectives on
-    a *fixed* set of windows, a statistic that means the same from step to step. So no step that improves one
-    objective at another's cost ever moves a bound. ``bounds`` are ``(networks, objectives)``; ``rho`` is the
-    sharpness of the maximum: 10 keeps the value within log(2)/10 of the hard maximum of two.
+    :meth:`value`, a smooth maximum of L_j / c_j, is minimized on mini-batches. :meth:`lower` evaluates the objectives
+    on a *fixed* set of windows, so values of different steps are comparable. A step that improves one objective at the
+    expense of another does not change a bound. ``bounds`` are ``(networks, objectives)``. ``rho`` is the sharpness of
+    the maximum: with 10, the value of two objectives differs from the maximum by at most log(2)/10.
     """
 
     def __init__(self, bounds: Tensor, rho: float = 10.0) -> None:
@@ -37,7 +37,7 @@ class VectorPerformanceIndex:
         return torch.logsumexp(self.rho * losses / self.bounds, dim=-1) / self.rho
 
     def lower(self, losses: Tensor) -> VectorPerformanceIndex:
-        """The index with every bound lowered to its loss, in the networks where no loss exceeds its bound."""
+        """Lower every bound to its loss, for the networks in which no loss exceeds its bound."""
         keeps = (losses <= self.bounds).all(dim=-1, keepdim=True)
         bounds = torch.where(keeps, torch.minimum(losses, self.bounds), self.bounds)
         return VectorPerformanceIndex(bounds, self.rho)
@@ -45,11 +45,16 @@ class VectorPerformanceIndex:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A model's prediction along windows and the measurement, at the periods' starts; ``(..., n_x)``, ``(..., n_u)``
-    and ``(..., n_w)``.
+    """A model's prediction along windows, and the measurement, at the start of each period.
 
-    ``x_hat`` are the measured states under teacher forcing; rates ``xdot`` are as the model's form has them (hybrid:
-    means over the period). ``weight`` ``(networks, n)`` says how much a window counts for each network.
+    Args:
+        x: Measured states ``(..., n_x)``.
+        x_hat: Predicted states ``(..., n_x)``; the measured states under teacher forcing.
+        u: Inputs ``(..., n_u)``.
+        w: Disturbances ``(..., n_w)``.
+        xdot: Measured rates ``(..., n_x)`` in the model's form (hybrid: means over the period).
+        xdot_hat: Predicted rates ``(..., n_x)`` in the same form.
+        weight: Weight of each window for each network ``(networks, n)``. Default: equal weights.
     """
 
     x: Tensor
@@ -65,7 +70,7 @@ Objective: TypeAlias = Callable[[RecurrentStep, Prediction], Tensor]
 
 
 def teacher_forced(step: RecurrentStep, windows: Windows) -> Prediction:
-    """One-period predictions from the measured states; only h runs along (the paper's training)."""
+    """One-step predictions from the measured states; only h is propagated (the paper's training)."""
     x, u, w = (z.transpose(0, 1) for z in (windows.x[:, :-1], windows.u, windows.w))
     features = step.stacked_features(x, u, w)
     stack = cast(StackedGRU, step.network)
@@ -89,7 +94,7 @@ def warm_up(step: RecurrentStep, windows: Windows) -> Tensor:
 
 
 def free_run(step: RecurrentStep, windows: Windows) -> Prediction:
-    """The model's own free run over the scored part, h warmed up on the measured past."""
+    """Free run over the evaluated part of each window; the measured warm-up sets h."""
     h = warm_up(step, windows)
     x = windows.x[:, windows.warm].unsqueeze(0).expand(h.shape[0], -1, -1)
     u, w = (z[:, windows.warm :].transpose(0, 1).unsqueeze(1) for z in (windows.u, windows.w))
@@ -101,20 +106,20 @@ def free_run(step: RecurrentStep, windows: Windows) -> Prediction:
 
 
 def error_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
-    """Mean absolute error of xdot, each rate over its spread, a value per network.
+    """Mean absolute error of xdot, each rate over its spread; one value per network.
 
-    The paper adds up rates of other units as they are (MAE, and E_sim on free runs); so do the figures of its results.
+    The paper adds rates of different units without scaling (MAE, and E_sim on free runs).
     """
     error = (prediction.xdot_hat - prediction.xdot).abs() / step.scale_xdot
     return _per_network(error.mean(-1), prediction.weight)
 
 
 def balance_objective(name: str) -> Objective:
-    """Mean violation of a balance, |residual of the model - residual of the measurement| [its rate_unit], a value per
-    network, with the prior's parameters for both (paper: |ΔE_M - ΔE_S|).
+    """Objective of a balance: mean violation |residual of the model - residual of the measurement| [its rate_unit].
 
-    At a measured state (:func:`teacher_forced`) that of a mechanical machine's energy is M|v||a_M - a_S|, a
-    speed-weighted error; along the model's own free run (:func:`free_run`) it also weighs where the model has gone.
+    One value per network; both residuals use the prior's parameters (paper: |ΔE_M - ΔE_S|). At a measured state
+    (:func:`teacher_forced`), the violation of a mechanical machine's energy is M |v| |a_M - a_S|, a speed-weighted
+    error. Along a free run (:func:`free_run`), the error of the states contributes too.
     """
 
     def violation(step: RecurrentStep, prediction: Prediction) -> Tensor:
@@ -127,9 +132,9 @@ def balance_objective(name: str) -> Objective:
 
 
 def output_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
-    """Root mean square error of the outputs a period later, each over its spread; a value per network.
+    """Root mean square error of the outputs one period later, each over its spread; one value per network.
 
-    On free runs it is the usual figure of a simulation; the mean absolute error of xdot weighs mostly the fast states.
+    On free runs, this is the usual error of a simulation; the mean absolute error of xdot mainly weights fast states.
     """
     held = prediction.u, prediction.w, step.p
     y = step.equations.output(prediction.x + step.dt * prediction.xdot, *held)
@@ -140,16 +145,16 @@ def output_objective(step: RecurrentStep, prediction: Prediction) -> Tensor:
 
 
 OBJECTIVES: dict[str, Objective] = {"error": error_objective, "output": output_objective}
-"""Objectives of any machine by name; beside them each balance of its prior is one, by its name."""
+"""Objectives of any machine by name; each balance of the prior is another objective, by its name."""
 BALANCES = "balances"
-"""Stands for all balances of the prior; for none, if it has none."""
+"""Name for all balances of the prior, if any."""
 
 
 def objectives_of(prior: Prior, names: Sequence[str]) -> dict[str, Objective]:
-    """Objectives by name, each balance by its own.
+    """Objectives by name; each balance has its own.
 
     Raises:
-        InputError: If a name is none of an objective or balance of the prior, or there is none left.
+        InputError: If a name is not an objective or a balance of the prior, or no objective results.
     """
     balances = [b.name for b in prior.equations.balances]
     wanted = [one for name in names for one in (balances if name == BALANCES else [name])]
@@ -164,7 +169,7 @@ def objectives_of(prior: Prior, names: Sequence[str]) -> dict[str, Objective]:
 
 
 def _per_network(values: Tensor, weight: Tensor | None) -> Tensor:
-    """Mean over time and windows of ``(T, networks, n)``, the windows weighted."""
+    """Mean of ``(T, networks, n)`` over time and weighted windows."""
     if weight is None:
         return values.mean(dim=(0, 2))
     counted = torch.where(weight > 0, values.mean(dim=0), 0.0)

@@ -1,4 +1,4 @@
-"""A prior's free parameters and input delay as one vector, and its free runs with their derivatives by that vector."""
+"""Free parameters and input delay of a prior as one vector, and free runs with derivatives by that vector."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 GROWN = 10.0, 100.0
-"""Growth of a small error over the two shortest windows of a machine that runs away."""
+"""Growth of a small error over the two shortest windows of an unstable machine."""
 LOOSE = 30.0
-"""Half ranges from its nominal value that cost a parameter as much as a single error of one standard deviation: what
-the data tell moves by a thousandth of its standard error at most, what they do not tell stays."""
+"""Distance of a parameter from its nominal value, in half ranges, that costs as much as one error of one standard
+deviation. This pull moves an identifiable parameter by at most a thousandth of its standard error, and keeps a
+parameter that is not identifiable at its nominal value."""
 Slopes: TypeAlias = Literal["", "x", "all"]
-"""Which derivatives are asked for: none, by the first states, by the parameters too."""
+"""Requested derivatives: none, with respect to initial states, or with respect to parameters too."""
 
 
 class OutputFit:
-    """A prior's free parameters and its input's delay ``theta``, each over its size, and their fit to windows.
+    """A prior's free parameters and input delay as ``theta``, each over its size, and free runs for ``theta``.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
         dt: Model period [s].
-        largest_delay: Longest delay [s] of the inputs. Default 0: it is not fitted.
+        largest_delay: Largest delay [s] of the inputs. Default 0: no delay is fitted.
     """
 
     def __init__(self, make: Callable[..., Prior], dt: float, largest_delay: float = 0.0) -> None:
@@ -48,9 +49,9 @@ class OutputFit:
         self.unit = np.array([*own, *late])
         self._simulations: dict[tuple[int, ...], Simulation] = {}
         self.points: Points | None = None
-        """Where the recordings go, once their states are known."""
+        """Points of the recordings, once their states are known."""
         self.least = 1
-        """Sub-steps a period at least."""
+        """Minimum number of sub-steps a period."""
         self.nominal = (
             np.array([*(p.value for p in self.free), *(0.5 * largest_delay for _ in late)]) / self.unit
         )
@@ -58,7 +59,7 @@ class OutputFit:
         self.upper = np.array([*(p.upper for p in self.free), *(largest_delay for _ in late)]) / self.unit
 
     def with_delay(self, largest: float) -> OutputFit:
-        """The same fit, of a delay of up to ``largest`` [s], too."""
+        """Copy this fit, and also fit a delay of up to ``largest`` [s]."""
         other = OutputFit(self.make, self.dt, largest)
         other._simulations, other.points, other.least = self._simulations, self.points, self.least
         return other
@@ -70,44 +71,44 @@ class OutputFit:
 
     @property
     def pull(self) -> Array:
-        """Root of the weights that hold ``theta`` at the nominal values."""
+        """Root of the weights of the pull towards the nominal values."""
         return 1.0 / (LOOSE * self.half)
 
     @property
     def names(self) -> list[str]:
-        """Names of what is fitted."""
+        """Names of the fitted parameters, with ``"delay"`` if it is fitted."""
         return [*(p.name for p in self.free), *(["delay"] if self.largest else [])]
 
     @property
     def lead(self) -> int:
-        """Samples before a window that its delayed inputs may need."""
+        """Number of samples before a window that delayed inputs may need."""
         return math.ceil(self.largest / self.dt) + 1 if self.largest else 0
 
     def values(self, theta: Array) -> dict[str, float]:
-        """Values [their units] of all parameters by name, fixed ones included."""
+        """Values [their units] of all parameters by name, with fixed ones."""
         fitted = {p.name: float(v) for p, v in zip(self.free, theta * self.unit, strict=False)}
         return {**self.prior.values, **fitted}
 
     def scaled(self, values: Mapping[str, float], delay: float = 0.0) -> Array:
-        """Values [their units] by name, and the delay [s], as ``theta``."""
+        """Convert values [their units] by name, and the delay [s], to ``theta``."""
         own = [values[p.name] for p in self.free]
         return np.array([*own, *([delay] if self.largest else [])]) / self.unit
 
     def delay(self, theta: Array) -> float:
-        """Delay [s]; none where it is too short to count."""
+        """Delay [s]; 0 below 5 % of a period."""
         found = float(theta[-1] * self.unit[-1]) if self.largest else 0.0
         return found if found >= NONE * self.dt else 0.0
 
     def substeps(self, theta: Array) -> int:
-        """Sub-steps a period that the stiffness at ``theta`` asks for, at rest and where the recordings go."""
+        """Number of sub-steps a period that the stiffness at ``theta`` requires, at rest and along the recordings."""
         return max(self.least, required_substeps(self.make(self.values(theta)), self.dt, self.points))
 
     def most_substeps(self, thetas: Array) -> int:
-        """As many as the stiffest of several ``thetas`` ``(m, k)`` needs."""
+        """Largest number of sub-steps that one of several ``thetas`` ``(m, k)`` requires."""
         return max(self.substeps(one) for one in thetas)
 
     def reach(self, theta: Array) -> float:
-        """Time [s] over which a small error grows by the larger of ``GROWN`` at ``theta``, where the recordings go."""
+        """Time [s] in which a small error grows by the larger of ``GROWN`` at ``theta``, along the recordings."""
         rate = 0.0 if self.points is None else growth_rate(self.make(self.values(theta)), self.points)
         return math.log(GROWN[-1]) / rate if rate > 0 else math.inf
 
@@ -116,8 +117,8 @@ class OutputFit:
     ) -> tuple[Array, Array]:
         """Outputs ``(n, T + 1, n_y)`` of free runs from ``x``, and their derivatives ``(n, T + 1, n_y, columns)``.
 
-        Columns are those by ``theta`` and, behind these, by ``x``; by ``x`` alone; or none (``slopes``). Several
-        ``theta`` ``(m, k)`` share the windows evenly, the first ones to the first.
+        ``slopes`` selects the columns: derivatives by ``theta``, then by ``x``; by ``x`` only; or none. Several
+        ``theta`` ``(m, k)`` belong to consecutive parts of the windows, all of the same number.
         """
         thetas, n = np.atleast_2d(theta), len(x)
         each = n // len(thetas)
@@ -129,21 +130,21 @@ class OutputFit:
             return simulation.values(*given), np.zeros(0)
         y, by = simulation.by_all(*given)
         if slopes == "all":
-            with np.errstate(over="ignore"):  # what runs away is left out where it is used
+            with np.errstate(over="ignore"):  # diverging runs are left out later
                 by[..., : len(self._free)] *= self.unit[: len(self._free)]
         return y, by
 
     def _every(self, thetas: Array) -> list[list[float]]:
-        """What a simulation has as its parameters with each of several ``thetas``."""
+        """Parameters of the simulation for each of several ``thetas``."""
         return [self._constants(one) for one in thetas]
 
     def _constants(self, theta: Array) -> list[float]:
-        """What a simulation has as its parameters: the prior's, and a small change of the delay."""
+        """Parameters of the simulation: the prior's, and a small change of the delay."""
         return [*self.values(theta).values(), 0.0]
 
     @cached_property
     def _free(self) -> list[int]:
-        """Places of what is fitted in :meth:`_constants`."""
+        """Indices of the fitted parameters in :meth:`_constants`."""
         every = [*(p.name for p in self.prior.parameters), "delay"]
         return [every.index(name) for name in self.names]
 
@@ -154,7 +155,7 @@ class OutputFit:
         return self._simulations[free]
 
     def _acting(self, theta: Array, commanded: Array, windows: OutputWindows) -> Array:
-        """Inputs ``(n, T + 1, 2 n_u)`` that act, means over each period, and their derivative by the delay."""
+        """Inputs that act (means over each period) and their derivative by the delay, ``(n, T + 1, 2 n_u)``."""
         n, first = windows.y.shape[1], windows.lead
         if not self.largest:
             u = commanded[:, first : first + n]
@@ -168,7 +169,7 @@ class OutputFit:
 
 @lru_cache(maxsize=64)
 def delayed(f: ca.Function) -> ca.Function:
-    """``f(x, u, w, p)`` of inputs ``[u, slope by the delay]`` and parameters ``[p, change of the delay]``."""
+    """``f(x, u, w, p)`` with inputs ``[u, derivative by the delay]`` and parameters ``[p, change of the delay]``."""
     x, u, w, p = (ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4))
     slope, change = ca.SX.sym("slope", u.shape[0]), ca.SX.sym("change")
     given = [x, ca.vertcat(u, slope), w, ca.vertcat(p, change)]

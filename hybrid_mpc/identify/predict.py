@@ -29,16 +29,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Predicted:
-    """Predicted outputs beside the measured ones.
+    """Predicted outputs, and their errors.
 
     Args:
-        y_hat: Predictions ``(n, n_y)`` [output units]; NaN one step ahead of a sample that was not measured.
-        half_width: Half widths of the band ``(n, n_y)``; NaN where there is none.
-        rmse: Root mean square of the residuals by output, ``"phi [rad]"``; None where a run diverged.
-        fit_percent: ``100 (1 - RMSE / standard deviation of the measurement)`` by output; None where a run diverged, or
-            the output does not change.
-        inside: Share of the measurements within the band, by output; None where there is no band.
-        share: Share that the band is to hold.
+        y_hat: Predictions ``(n, n_y)`` [output units]; one-step predictions are NaN for missing samples.
+        half_width: Half widths of the band ``(n, n_y)``; NaN without a band.
+        rmse: Root mean square of the residuals by output, ``"phi [rad]"``; None if a run diverged.
+        fit_percent: ``100 (1 - RMSE / standard deviation of the measurement)`` by output; None if a run diverged or the
+            output is constant.
+        inside: Share of the measurements within the band, by output; None without a band.
+        share: Nominal share of the band.
     """
 
     y_hat: Array
@@ -51,7 +51,7 @@ class Predicted:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model predicts of a recording after its warm-up, ``n`` samples.
+    """Predictions of a recording after its warm-up, ``n`` samples.
 
     Args:
         name: Name of the recording.
@@ -59,9 +59,9 @@ class Prediction:
         outputs: Signals of ``y``.
         t: Times ``(n,)`` [s] in the recording's own time.
         y: Measurement ``(n, n_y)``; NaN where a sample is missing.
-        free_run: From the state that the warm-up tells, under the measured inputs alone.
-        one_step: By the observer that loops have, from all samples before; None where the artifact has none.
-        reason: Why there are no one-step predictions. Default: there are.
+        free_run: Free run from the state after the warm-up, with the measured inputs.
+        one_step: One-step predictions of the loops' observer; None if the artifact has no observer.
+        reason: Why there are no one-step predictions. Default: there are one-step predictions.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Prediction:
     reason: str = ""
 
     def columns(self) -> dict[str, Array]:
-        """The prediction as columns of a table ``(n,)`` with units in their names."""
+        """Columns ``(n,)`` of a table of the prediction, with units in their names."""
         found = {"t_s": self.t}
         runs = (("", self.free_run), ("_one_step", self.one_step))
         for j, signal in enumerate(self.outputs):
@@ -90,21 +90,21 @@ class Prediction:
 
 
 def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
-    """Free run and one-step predictions of a recording, with bands.
+    """Compute a free run and one-step predictions of a recording, with bands.
 
-    The first ``warm_up`` seconds of the recording give the first state, smoothed by the fitted prior, and the networks'
-    memory; they are not predicted. The free run's band is the one that validation calibrated (docs/predict.md); it
-    grows on beyond the longest run that it was calibrated on, where nobody has tried it. One-step predictions are those
-    of ``kit.observer(model)``; their band is what its own covariance says, not calibrated.
+    The first ``warm_up`` seconds of the recording determine the initial state (smoothed by the fitted prior) and the
+    networks' hidden state; they are not predicted. The band of the free run was calibrated on validation runs
+    (docs/predict.md). Beyond the longest of these runs, the band grows further without calibration. One-step
+    predictions are those of ``kit.observer(model)``; their band follows from the observer's covariance.
 
     Args:
         kit: A loaded artifact.
-        trajectory: A recording on the model's grid, inputs as they were commanded; its states are not used.
-        model: ``"prior"`` or ``"hybrid"``. Default: the recommended one.
+        trajectory: A recording on the model's grid, with commanded inputs; its states are not used.
+        model: ``"prior"`` or ``"hybrid"``. Default: the recommended model.
 
     Raises:
-        InputError: If there is no such model, the artifact does not hold what predictions need, or the recording is
-            shorter than the warm-up or has another period.
+        InputError: If the model does not exist, the artifact lacks data for predictions, or the recording is shorter
+            than the warm-up or has another period.
 
     Example:
         ``prediction = hm.predict(hm.load("runs/mine"), trajectory); prediction.free_run.fit_percent``
@@ -171,7 +171,7 @@ def _checked(kit: Kit, trajectory: Trajectory, model: str) -> tuple[str, Predict
 
 
 def stored_prior(kit: Kit, held: Predicting) -> Prior:
-    """The fitted prior of an artifact, its equations from the stored programs."""
+    """Create the fitted prior of an artifact from the stored programs."""
     model = kit.models["prior"]
 
     def expressions(self: Prior, x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[Any, Any, tuple[()]]:
@@ -191,7 +191,7 @@ def _free_run(model: HybridModel, whole: Trajectory, x: Array, lost: int, warm: 
     step = BufferedFunction(model.step)
     step.inputs[4][:] = model.p
     h = np.zeros(model.n_h)
-    if model.delay_states:  # the inputs on their way, the oldest first
+    if model.delay_states:  # the delayed inputs, the oldest first
         h[: model.delay_states] = whole.u[lost - model.delay_states // model.n_u : lost].ravel()
     u, w = whole.u[lost:], whole.w[lost:]
     states = np.empty((len(u) - warm, model.n_x))
@@ -207,14 +207,14 @@ def _free_run(model: HybridModel, whole: Trajectory, x: Array, lost: int, warm: 
 
 
 def _outputs(prior: Prior, x: Array, u: Array, w: Array) -> Array:
-    """Outputs ``(n, n_y)`` as the sensors show them: within the ranges that they declare."""
+    """Outputs ``(n, n_y)``, clipped to the sensors' declared ranges."""
     ends = np.array([s.saturation or (-np.inf, np.inf) for s in prior.outputs]).T
     y = prior.equations.output(x.T, u.T, w.T, prior.p).full().T
     return np.asarray(np.clip(y, *ends))
 
 
 def _one_step(kit: Kit, name: str, recording: Trajectory) -> tuple[Array, Array]:
-    """Predictions of each sample from those before, and half widths of their band, both ``(n, n_y)``."""
+    """One-step predictions of each sample, and half widths of their band, both ``(n, n_y)``."""
     observer, model = kit.observer(name), kit.models[name]
     n, n_y = recording.y.shape
     hat, variance = np.full((2, n, n_y), np.nan)

@@ -1,4 +1,4 @@
-"""A prior as programs of a deployed model, without torch."""
+"""Export of a prior as programs of a deployed model, without torch."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from hybrid_mpc.machine.prior import POINT, Prior
 
 
 def prior_programs(prior: Prior, dt: float, substeps: int = 0) -> dict[str, nn_export.Program]:
-    """Programs of the prior alone: ``step`` and ``xdot`` with no hidden state, ``output``, and its balances.
+    """Programs of the prior: ``step`` and ``xdot`` without hidden state, ``output``, and its balances.
 
-    A period is integrated in ``substeps``. Default 0: as many as the prior needs at rest.
+    ``substeps`` is the number of Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
     """
     equations = prior.equations
     names = dict(zip(POINT, (prior.states, prior.inputs, prior.disturbances, prior.parameters), strict=True))
@@ -44,7 +44,7 @@ def prior_programs(prior: Prior, dt: float, substeps: int = 0) -> dict[str, nn_e
 
 
 def balances_of(prior: Prior) -> tuple[BalanceInfo, ...]:
-    """What an artifact says of a prior's balances."""
+    """Description of a prior's balances in an artifact."""
     return tuple(BalanceInfo(b.name, b.unit, b.rate_unit) for b in prior.equations.balances)
 
 

@@ -1,8 +1,8 @@
-"""Prior replay: where nothing was measured, the training asks a network for no correction.
+"""Prior replay: the training penalizes a network's correction in states far from all recordings.
 
-A network extrapolates freely: upright, on a pendulum that was only swung, its correction is arbitrary. Prior replay are
-short runs of the prior from states anywhere in the measured range, all the way round for an angle. Where they pass
-through states that no recording comes near, the training penalises the correction.
+A network extrapolates without limits: for a pendulum that was only swung, the correction in the upright position is
+arbitrary. Prior replay consists of short runs of the prior, from random states in the measured range (for an angle, the
+whole turn). In states far from all recordings, the training penalizes the correction.
 """
 
 from __future__ import annotations
@@ -25,28 +25,29 @@ from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 RUNS = 2000
-"""Runs in all."""
+"""Number of runs."""
 BATCH = 64
-"""Runs a training step."""
+"""Number of runs in a training step."""
 FOLLOWED = 10
-"""Periods that the hidden state is given to follow a run before its corrections count."""
+"""Periods of a run before its corrections count, so that the hidden state settles."""
 COUNTED = 20
-"""Periods whose corrections count."""
+"""Periods of a run whose corrections count."""
 HELD = 5
-"""Periods that an input is held; each is one that was recorded."""
+"""Periods for which an input is held; all inputs are recorded ones."""
 AWAY = 10.0
-"""Ranges beyond the measured one of a state that is no angle at which a run ends: a prior may run away."""
+"""Distance beyond the measured range, in ranges, at which a run stops, because a prior may be unstable (not for
+angles)."""
 NEAR = 0.1
-"""Distance from measured states at which a state has 0.63 of its weight: each state over its root mean square in the
-recordings, an angle by sine and cosine."""
+"""Distance from measured states at which the weight is 0.63. Each state is scaled by its root mean square in the
+recordings; an angle is represented by sine and cosine."""
 
 
 @dataclass(frozen=True)
 class PriorReplay:
-    """Runs of the prior ``(FOLLOWED + COUNTED, n, ...)`` [SI], and how much each of their states counts.
+    """Runs of the prior ``(FOLLOWED + COUNTED, n, ...)`` [SI], and the weight of each state.
 
-    The weight is 0 at a recorded sample, 1 far from all of them, 0 beyond the measured range of a state that is no
-    angle.
+    The weight is 0 at a recorded sample and 1 far from all recorded samples. It is 0 outside the measured range of a
+    state that is not an angle.
     """
 
     x: Tensor
@@ -55,17 +56,17 @@ class PriorReplay:
     weight: Tensor
 
     def take(self, index: Tensor) -> PriorReplay:
-        """The runs of ``index``."""
+        """Select the runs of ``index``."""
         index = index.to(self.x.device)
         return PriorReplay(self.x[:, index], self.u[:, index], self.w[:, index], self.weight[:, index])
 
     def to(self, device: torch.device) -> PriorReplay:
-        """The same runs on a device."""
+        """Move the runs to a device."""
         return PriorReplay(*(v.to(device) for v in (self.x, self.u, self.w, self.weight)))
 
 
 def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -> PriorReplay:
-    """Prior replay around training trajectories."""
+    """Simulate prior replay for training trajectories."""
     rng = np.random.default_rng([seed, 1])
     x, u, w = (np.concatenate([getattr(t, key) for t in training]) for key in ("x", "u", "w"))
     low, high = x.min(0), x.max(0)
@@ -86,7 +87,7 @@ def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -
 
 
 def prior_replay_penalty(step: RecurrentStep, prior_replay: PriorReplay) -> Tensor:
-    """Mean over all runs of weight times squared correction over its scale, a value per network."""
+    """Mean over all runs of weight times squared (scaled) correction; one value per network."""
     stack = cast(StackedGRU, step.network)
     features = step.stacked_features(prior_replay.x, prior_replay.u, prior_replay.w)
     out, _ = stack.sequence(features, stack.initial(prior_replay.x.shape[1]))
@@ -97,7 +98,7 @@ def prior_replay_penalty(step: RecurrentStep, prior_replay: PriorReplay) -> Tens
 def _prior_runs(
     step: PriorStep, start: Array, held: tuple[Array, Array], bounds: tuple[Array, Array]
 ) -> Array:
-    """States ``(n, RUNS, n_x)`` of the prior alone; a run that would leave the bounds stays where it is."""
+    """States ``(n, RUNS, n_x)`` of the prior alone; a run that would leave the bounds stops at its last state."""
     none = torch.zeros(len(start), 0, dtype=torch.float64)
     low, high = (torch.tensor(bound) for bound in bounds)
     x, states = torch.tensor(start), []
@@ -112,7 +113,7 @@ def _prior_runs(
 
 @dataclass(frozen=True)
 class _Places:
-    """States as points between which a distance says something."""
+    """Maps states to scaled points for distances; an angle becomes sine and cosine."""
 
     angles: NDArray[np.bool_]
     scale: Array

@@ -1,4 +1,4 @@
-"""What a fit of the prior gives: values, standard errors, and what the data do not identify. No torch in here."""
+"""Result of a fit of the prior: values, standard errors, unidentifiable parameters. No torch in here."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CORRELATED = 0.99
-"""Two parameters whose errors are correlated by more can hardly be told apart."""
+"""Correlation of the errors of two parameters above which the two are reported."""
 ENOUGH = 1.01
-"""Ratio to the least error up to which the longest windows win: they tell most of the parameters."""
+"""Ratio to the least error up to which the longest windows win: long windows identify the parameters best."""
 PREDICTIONS = "predictions"
 """Name of the stage that is fitted by predictions one period ahead instead of free runs."""
 LEAST_T = 2.0
-"""A parameter below so many standard errors may be zero."""
+"""Ratio of a value to its standard error below which the parameter may be zero."""
 
 
 def winner(stages: Sequence[str], errors: Sequence[float]) -> int:
-    """Place of the stage that wins: the last of those whose error is the least but for one per cent, since it had the
-    longest windows; ``PREDICTIONS`` must be better by that.
+    """Index of the stage to use: the last stage (longest windows) whose error is within 1 % of the least error.
+
+    The stage ``PREDICTIONS`` is used only if its error is more than 1 % below that of all others.
 
     Example:
         >>> winner(["nominal", "short", "long", "longer"], [0.5, 0.1, 0.1005, 0.2])
@@ -43,18 +44,18 @@ def winner(stages: Sequence[str], errors: Sequence[float]) -> int:
 
 @dataclass(frozen=True)
 class Combination:
-    """Parameters that the recordings do not tell apart, and what they tell of them together.
+    """Parameters that are not identifiable one by one, and the combination of them that is.
 
     Args:
-        parameters: Their names. A single one they do not tell within its range.
-        weights: Of each in the combination that is known best, the largest 1. Default: none is known.
-        product: The combination is the product of the parameters, each to the power of its weight, instead of the sum
-            of the parameters times theirs. Default: the sum.
-        error: Standard error of the combination: of a product relative to it [-], of a sum in its unit.
+        parameters: Their names. A single parameter is not identifiable within its range.
+        weights: Weight of each parameter in the identifiable combination; the largest is 1. Default: no combination.
+        product: True: the combination is the product of the parameters, each to the power of its weight. Default: the
+            combination is the sum of the parameters, each times its weight.
+        error: Standard error of the combination: relative [-] for a product, in its unit for a sum.
 
     Example:
         >>> print(Combination(("k", "m"), (1.0, -1.0), True, 0.01))
-        the data cannot tell apart: k, m; known is k * m^-1, to 1 %
+        only a combination of k, m is identifiable: k * m^-1, to 1 %
     """
 
     parameters: tuple[str, ...]
@@ -64,7 +65,7 @@ class Combination:
 
     def __str__(self) -> str:
         if not self.weights:
-            return f"the data do not tell {', '.join(self.parameters)} within its range"
+            return f"{', '.join(self.parameters)} is not identifiable within its range"
         of = [(name, w) for name, w in zip(self.parameters, self.weights, strict=True) if abs(w) >= 0.005]
         if self.product:
             text = " * ".join(name if abs(w - 1.0) < 0.005 else f"{name}^{w:.2g}" for name, w in of)
@@ -72,7 +73,7 @@ class Combination:
         else:
             text = " + ".join(name if abs(w - 1.0) < 0.005 else f"{w:.3g} {name}" for name, w in of)
             text = text.replace("+ -", "- ") + f", to {self.error:.2g}"
-        return f"the data cannot tell apart: {', '.join(self.parameters)}; known is {text}"
+        return f"only a combination of {', '.join(self.parameters)} is identifiable: {text}"
 
 
 @dataclass(frozen=True)
@@ -80,20 +81,20 @@ class PriorFit:
     """Fitted parameters with their standard errors.
 
     Args:
-        values: Fitted values [SI] by name, fixed ones included.
-        standard_errors: Standard errors [SI] of the fitted ones, from the scatter over parts of the windows (they hold
-            for a model without structural error, so read them as lower bounds); half of its range at most.
-        warnings: Parameters at a bound, or ones that the data do not identify.
-        stages: One row per stage: its name and the validation error that chose the winner.
+        values: Values [SI] of all parameters by name, fitted and fixed.
+        standard_errors: Standard errors [SI] of the fitted parameters, from the scatter over parts of the windows. They
+            assume a model without structural error, so they are lower bounds. At most half of the parameter's range.
+        warnings: Parameters at a bound, and parameters that are not identifiable.
+        stages: One row for each stage of the fit: its name and its validation error, which selects the stage.
         correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.
         delay: Delay of the inputs [s]. Default: none.
-        sigma: Standard deviation of each output's measurement that the smoother assumes [output units].
-        walk: Standard deviation of the unexplained rates' change per period that it assumes, by corrected state.
-        sizes: Natural sizes of the signals that the smoother assumes.
-        fading: What is left of an unexplained rate after a period, where nothing tells of it [-].
-        substeps: Runge-Kutta sub-steps a period that the fitted prior needs where the recordings go. Default 0: as many
-            as it needs at rest.
-        unidentified: Parameters that the recordings do not tell apart. Default: none.
+        sigma: Standard deviation of each output's measurement in the smoother [output units].
+        walk: Standard deviation of the change of each unexplained rate in one period, by corrected state.
+        sizes: Natural sizes of the signals in the smoother.
+        fading: Factor by which an unexplained rate decays in one period without data [-].
+        substeps: Runge-Kutta sub-steps a period that the fitted prior needs within the range of the recordings.
+            Default 0: as many as it needs at rest.
+        unidentified: Parameters that are not identifiable one by one. Default: none.
     """
 
     values: dict[str, float]
@@ -112,18 +113,18 @@ class PriorFit:
     def smoother(self, prior: Prior, dt: float) -> Smoother:
         """The smoother around the fitted prior."""
         if self.sizes is None:
-            raise InputError("fit: it has no smoother. Use a fit made by fit_prior [HM-IDENTIFY-045]")
+            raise InputError("fit: this fit has no smoother. Use a fit of fit_prior [HM-IDENTIFY-045]")
         return Smoother(prior, dt, self.sigma, self.walk, self.sizes, self.fading, self.substeps)
 
     @property
     def best(self) -> str:
-        """Name of the stage that won."""
+        """Name of the stage that was selected."""
         names, errors = ([row[key] for row in self.stages] for key in ("stage", "validation_error"))
         return str(names[winner(names, errors)])
 
     @property
     def t_ratios(self) -> dict[str, float]:
-        """Value over standard error of every fitted parameter, by name; infinite without error."""
+        """Ratio of value to standard error of every fitted parameter, by name; infinite if the error is zero."""
         return {
             name: self.values[name] / error if error else float("inf")
             for name, error in self.standard_errors.items()
@@ -131,7 +132,7 @@ class PriorFit:
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """What the data do not identify: :attr:`warnings`, correlations above 0.99, t-ratios below 2."""
+        """Texts about poorly identifiable parameters: :attr:`warnings`, correlations above 0.99, t-ratios below 2."""
         close = [
             f"{names.replace(', ', ' and ')} can hardly be told apart: their errors are correlated by {value:.3f}"
             for names, value in self.correlations.items()
@@ -145,7 +146,10 @@ class PriorFit:
         return (*self.warnings, *close, *small)
 
     def covariance(self, parameters: Sequence[Parameter]) -> tuple[tuple[float, ...], ...]:
-        """Rows of the covariance of the fitted values, as an artifact stores it; fixed parameters have none."""
+        """Covariance matrix of the values, row by row, as an artifact stores it; zero for fixed parameters.
+
+        Empty if a standard error is not known.
+        """
         errors = [0.0 if p.fixed else self.standard_errors.get(p.name, math.nan) for p in parameters]
         rows = tuple(
             tuple(a * b * self._correlation(p.name, q.name) for q, b in zip(parameters, errors, strict=True))
@@ -154,7 +158,10 @@ class PriorFit:
         return rows if all(math.isfinite(value) for row in rows for value in row) else ()
 
     def rows(self, parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
-        """One row a parameter: name, unit, nominal, fitted, standard error, t-ratio, largest correlation."""
+        """One row for each parameter: name, unit, nominal and fitted value, standard error, t-ratio, correlation.
+
+        ``correlation`` is that with the parameter whose error is most correlated.
+        """
         ratios = self.t_ratios
         return [
             {
@@ -170,7 +177,7 @@ class PriorFit:
         ]
 
     def table(self, parameters: Sequence[Parameter]) -> pd.DataFrame:
-        """:meth:`rows` as a data frame, by parameter; ``fit.table(prior.parameters).to_csv(path)`` writes it."""
+        """Return :meth:`rows` as a data frame; ``fit.table(prior.parameters).to_csv(path)`` writes it."""
         with named_extra("the table (rows() gives the same without)"):
             import pandas as pd
         return pd.DataFrame(self.rows(parameters)).set_index("parameter")

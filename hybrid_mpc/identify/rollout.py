@@ -1,8 +1,8 @@
-"""Free runs of a stack of hybrids over many windows at once, with the derivative of a whole run written by hand.
+"""Free runs of a stack of hybrids over many windows at once, with a hand-written derivative of the whole run.
 
-Automatic differentiation would record some hundred operations a period: the network's, and the prior's at every stage
-of every sub-step. Here CasADi integrates a period of all runs beside its exact derivatives in one call. The way back is
-a product with them and the network's own few operations.
+Automatic differentiation would record some hundred operations in each period: those of the network, and those of the
+prior in every stage of every sub-step. Here, one call of CasADi integrates a period of all runs and computes its exact
+derivatives. The backward pass is a product with these derivatives and a few operations of the network.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class Rollout:
     """Free runs of ``s = features(x, u, w, p)``, ``c, h_next = network(s, h)``, ``x_next = flow(x, c, u, w, p)``.
 
     Args:
-        features: What the network sees, as scalar operations.
-        flow: The state a period later, as scalar operations.
-        scale: Scale of the network's output, which makes it ``c``, ``(n_c,)``.
+        features: Features of the network, as scalar operations.
+        flow: State one period later, as scalar operations.
+        scale: Scale from the network's output to ``c``, ``(n_c,)``.
     """
 
     def __init__(self, features: ca.Function, flow: ca.Function, scale: Tensor) -> None:
@@ -51,8 +51,8 @@ class Rollout:
     def __call__(self, network: StackedGRU, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor) -> Tensor:
         """States ``(T + 1, networks, n, n_x)`` from ``x`` ``(networks, n, n_x)`` and ``h`` ``(networks, n, z)``.
 
-        ``u`` and ``w`` are ``(T, networks, n, ...)``, ``p`` ``(networks, 1, n_p)``. Differentiable once by ``x``,
-        ``h``, ``p`` and the network's weights.
+        ``u`` and ``w`` are ``(T, networks, n, ...)``, ``p`` ``(networks, 1, n_p)``. Differentiable once with respect to
+        ``x``, ``h``, ``p`` and the network's weights.
         """
         recurrent, direct = gate_matrices(network.w_ih, network.w_hh, network.b_ih, network.b_hh)
         held = u.contiguous(), w.contiguous(), p.expand(-1, x.shape[1], -1).contiguous()
@@ -63,13 +63,13 @@ class Rollout:
     def run(
         self, x: Tensor, h: Tensor, u: Tensor, w: Tensor, p: Tensor, weights: Sequence[Tensor], slopes: bool
     ) -> _Run:
-        """All states, and what the way back needs of every period."""
+        """Run forward; keeps all states, and the data of every period for the backward pass."""
         recurrent, direct, w_out, b_out = weights
         (networks, n, z), periods, count = h.shape, len(u), x.shape[0] * x.shape[1]
         run = _Run.empty(self, periods, networks, n, z, p.shape[-1], slopes)
         run.rows[:, 0, :, :z], run.rows[..., -1] = h, 1.0
         run.x[0] = x.flatten(0, 1).T
-        # runs are the last axis for CasADi; the last period's inputs go on
+        # runs are the last axis for CasADi; the inputs of the last period are repeated
         u_at, w_at = (torch.cat([a, a[-1:]]).flatten(1, 2).mT.contiguous().numpy() for a in (u, w))
         p_at, x_at, c = p.flatten(0, 1).T.contiguous().numpy(), run.x.numpy(), _new(self.n_c, count)
         seen = _new(self.n_in, count)
@@ -98,10 +98,10 @@ class Rollout:
 
 @dataclass(frozen=True)
 class _Run:
-    """What a free run leaves: states ``(T + 1, n_x, runs)``, and slopes of each period ``(columns, rows, runs)``.
+    """Data of a free run for the backward pass: states ``(T + 1, n_x, runs)``, derivatives ``(columns, rows, runs)``.
 
     A row in ``rows`` ``(networks, T + 1, n, z + n_in + 1)`` is ``[h, s, 1]``; ``gates`` ``(T, networks, n, 3 z)`` are
-    r, z and what is inside the reset product.
+    r, z and the factor of r in the candidate.
     """
 
     x: Tensor
@@ -114,7 +114,7 @@ class _Run:
 
     @classmethod
     def empty(cls, of: Rollout, periods: int, networks: int, n: int, z: int, n_p: int, slopes: bool) -> _Run:
-        """Memory for a run; slopes of no period but the first where none are wanted."""
+        """Allocate memory for a run; without ``slopes``, derivatives of the first period only."""
         count, kept, new = networks * n, periods if slopes else 0, _new
         return cls(
             new(periods + 1, of.n_x, count), new(networks, periods + 1, n, z + of.n_in + 1),
@@ -129,7 +129,7 @@ def _new(*shape: int) -> Tensor:
 
 
 class _FreeRun(torch.autograd.Function):
-    """All states of a run, and the derivative of the whole run."""
+    """All states of a run, as a function with a hand-written derivative."""
 
     @staticmethod
     def forward(ctx: Any, rollout: Rollout, slopes: bool, *given: Tensor) -> Tensor:
@@ -186,7 +186,7 @@ class _FreeRun(torch.autograd.Function):
 
 
 class _SideBySide:
-    """Scalar operations over many runs, each operation over all of them at once, on memory that is given."""
+    """Scalar operations vectorized over many runs, on given memory."""
 
     def __init__(self, given: Sequence[ca.SX], wanted: Sequence[ca.SX]) -> None:
         self._used, self._kept = ([i for i, a in enumerate(every) if a.numel()] for every in (given, wanted))
@@ -201,7 +201,7 @@ class _SideBySide:
         self._at = at
 
     def __call__(self, given: Sequence[Array], wanted: Sequence[Array]) -> None:
-        """Evaluate; all arrays are contiguous, the runs last, and a matrix lies column by column."""
+        """Evaluate; all arrays are contiguous, runs are the last axis, and matrices are stored column by column."""
         _, buffer, evaluate = self._at(given[0].shape[-1])
         for i, k in enumerate(self._used):
             buffer.set_arg(i, memoryview(given[k].data))

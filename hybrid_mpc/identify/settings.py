@@ -1,4 +1,4 @@
-"""Everything that decides a training."""
+"""Settings of a training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NO_BALANCE = "the prior has no balance, so a MOPGRNN would be the PGRNN once mor
 
 
 def kinds_of(prior: Prior) -> tuple[Kind, ...]:
-    """Kinds of networks that differ for a prior: one without balances has no second objective, so no MOPGRNN.
+    """Kinds of networks for a prior; a prior without balances has no second objective, so no MOPGRNN.
 
     Example:
         >>> from scenarios.pendulum.prior import PendulumPrior
@@ -31,40 +31,40 @@ def kinds_of(prior: Prior) -> tuple[Kind, ...]:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Everything that decides a training; two trainings with equal settings and data are equal.
+    """Settings of a training; trainings with equal settings and data have equal results.
 
     Args:
         kind: ``"rnn"`` (no prior), ``"pgrnn"`` (prior, first objective), ``"mopgrnn"`` (prior, all objectives).
         hidden: Hidden units z.
-        networks: Networks trained at once; they differ in their initial weights.
-        teacher_steps: Optimiser steps with teacher forcing.
-        free_run_steps: Optimiser steps on free runs.
+        networks: Number of networks trained at once; they differ in their initial weights.
+        teacher_steps: Optimizer steps with teacher forcing.
+        free_run_steps: Optimizer steps on free runs.
         seed: Seed of weights and batches.
         warm: Warm-up samples of a window.
-        horizon: Most scored periods of a free-run window; fewer where a trajectory is short
+        horizon: Maximum evaluated periods of a free-run window; fewer if trajectories are short
             (:func:`~hybrid_mpc.identify.dataset.fitting_horizon`).
-        batch: Windows a step.
-        decay: Weight decay of AdamW times the number of training samples: the more data there are, the less it counts.
-        learning_rates: Start and end of the cosine schedule, teacher forcing then free runs. The default suits networks
-            of 8 units; larger ones want half of it.
+        batch: Number of windows in a step.
+        decay: Weight decay of AdamW times the number of training samples; more data reduce the weight decay.
+        learning_rates: Start and end of the cosine schedule for teacher forcing, then for free runs. The default suits
+            networks of 8 units; use half of it for larger networks.
         every: Steps between evaluations (bounds, validation, checkpoint).
-        validation_horizon: Most scored periods of a validation window. Default: two thirds of a usual validation
-            recording, at most 1000 (:func:`~hybrid_mpc.identify.dataset.validation_horizon`). Trainings can be compared
-            by their validation only if this is the same.
-        objectives: Names in :data:`~hybrid_mpc.identify.objectives.OBJECTIVES`, of balances of the prior, or
-            ``"balances"`` for all of these; the curve has them all, the first one is that of free runs and validation.
-            Default: the outputs, which models are evaluated by, and all balances.
-        prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` along within their bounds, each network
-            its own. The energy balance of the objective keeps the fitted values.
-        prior_replay: Weight of the mean square of the correction (in its own scale) in states that no recording comes
-            near (:mod:`~hybrid_mpc.identify.prior_replay`); it is added to the objectives, which are in units of
-            their bounds. An rnn ignores it. Default: zero, none.
-        parts: Parts of the training data, of which network ``i`` leaves out part ``i``: the model is chosen by what
-            networks say of data that neither trained them nor chose their weights. Default 0: all are trained on all.
+        validation_horizon: Maximum evaluated periods of a validation window. Default: two thirds of a typical
+            validation recording, at most 1000 (:func:`~hybrid_mpc.identify.dataset.validation_horizon`). Validation
+            errors of two trainings are comparable only with equal validation horizons.
+        objectives: Names in :data:`~hybrid_mpc.identify.objectives.OBJECTIVES`, names of balances of the prior, or
+            ``"balances"`` for all balances. The curve holds all; the first one is used for free runs and validation.
+            Default: the outputs, which also evaluate models, and all balances.
+        prior_parameters: ``"fixed"`` at their fitted values, or ``"trained"`` within their bounds, separately for each
+            network. Balances in the objectives keep the fitted values. Default: ``"fixed"``.
+        prior_replay: Weight of the mean squared (scaled) correction in states far from all recordings
+            (:mod:`~hybrid_mpc.identify.prior_replay`), added to the objectives in units of their bounds. An rnn ignores
+            it. Default: 0, no prior replay.
+        parts: Number of parts of the training data; network ``i`` leaves out part ``i``. The choice of the model then
+            uses data that neither trained a network nor selected its weights. Default 0: all networks use all data.
 
     Raises:
-        InputError: If a name is not known, there is no objective, an rnn is to train the prior that it does not have,
-            prior_replay is negative, or there is one part, which would leave nothing to train on.
+        InputError: If a name is unknown, there is no objective, an rnn has trained prior parameters, prior_replay is
+            negative, or parts is 1.
 
     Example:
         >>> TrainingSettings("mopgrnn", 16, 4, 100, 100, seed=0, warm=10).objectives
@@ -104,10 +104,10 @@ class TrainingSettings:
 
     @property
     def shortest(self) -> int:
-        """Samples of a training trajectory that give windows of the horizon at several starts."""
+        """Minimum samples of a training trajectory for windows of the horizon with several start samples."""
         return self.warm + 1 + math.ceil(1.5 * self.horizon)
 
     @property
     def use_prior(self) -> bool:
-        """Whether the network sees the prior."""
+        """Whether the model contains the prior."""
         return self.kind != "rnn"

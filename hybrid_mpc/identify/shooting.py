@@ -1,6 +1,9 @@
-"""Multiple shooting: parameters and the first states of windows as one robust least-squares problem.
+"""Multiple shooting: parameters and initial states of windows as one robust least-squares problem.
 
-First states are eliminated from every step of Levenberg and Marquardt. Parameters stay within their bounds.
+Initial states are eliminated from every Levenberg-Marquardt step. Parameters stay within their bounds.
+
+With residuals r over their scales, initial states x, their guess x_0 over sizes s, the cost is
+``sum 2 c^2 (sqrt(1 + r^2 / c^2) - 1) + held |(x - x_0) / s|^2 + |pull (theta - nominal)|^2`` with ``c = OUTLIERS``.
 
 Source: Bock, *Recent advances in parameter identification techniques for O.D.E.* (1983).
 """
@@ -23,49 +26,50 @@ from hybrid_mpc.identify.windows import OutputWindows
 
 Array = NDArray[np.float64]
 ITERATIONS = 25
-"""Gauss-Newton steps of a length at most."""
+"""Maximum Gauss-Newton steps for one length of the windows."""
 FIRST = 4
-"""Steps at most before outputs and outliers are weighed by their residuals."""
+"""Maximum steps before outputs and outliers are weighted by their residuals."""
 LOOSELY = 1e-2
-"""Weight of a first state's distance from its guess, over its size, beside errors that are counted in spreads: a guess
-by the nominal prior is far off where that is, and errors are a small share of the spread once first states fit."""
+"""Weight of an initial state's distance from its guess, over its size, with errors in spreads. It is small because the
+guess of a wrong nominal prior is far off, and errors are far below the spread once the initial states fit."""
 ROUNDING = 1e-12
-"""Share that is added to the diagonal of the normal equations: first states that act alike stay solvable."""
+"""Relative increase of the diagonal of the normal equations, so that initial states with equal effects stay solvable."""
 STEEP = 1e8
-"""Slopes beyond this many spreads of an output per size of a first state or parameter do not count: a run diverges."""
+"""Limit of a derivative, in spreads of the output per size of an initial state or parameter. Larger derivatives belong
+to a diverging run and are ignored."""
 OUTLIERS = 3.0
-"""Residuals beyond this many robust standard deviations count by their size, not by its square."""
+"""Residual, in robust standard deviations, above which the loss is linear instead of quadratic."""
 COMMON = 0.7
-"""Least robust standard deviation of an output's errors, over their root mean square without gross outliers: where a
-prior is far off for a part of the time, that part is no outlier."""
+"""Minimum of the robust standard deviation of an output's errors, over their root mean square without gross outliers. So
+large errors during a part of the time, from a wrong prior, are no outliers."""
 GROSS = 10.0
-"""Residuals beyond this many robust standard deviations are left out at the end of a fit: any weight would bias it."""
+"""Residual, in robust standard deviations, above which a sample is left out at the end of a fit."""
 SCALINGS = 4
-"""Times at most that outputs are weighed by their residuals: outliers hide how small those are."""
+"""Maximum number of times that the scales are estimated again; outliers hide small residuals at first."""
 SETTLED = 0.8
-"""Share to which the scales must fall for another time."""
+"""Ratio of new to old scales below which they are estimated again."""
 FAR = 3.0
-"""Errors beyond this many spreads of the data are as bad as this one where candidates are compared."""
+"""Limit of an error, in spreads of the data, in the comparison of candidates."""
 LARGEST = 1e3
-"""Residuals beyond this many spreads of the data count as much: a free run that diverges stays finite."""
+"""Limit of a residual, in spreads of the data, so that a diverging free run stays finite."""
 COMPARED = 10
-"""Steps at most of the first states alone, where candidates are compared."""
+"""Maximum steps of the initial states alone, in the comparison of candidates."""
 FOLLOWING = 4
-"""Steps at most of the first states after ``theta``, where it would be rejected without."""
+"""Maximum steps of the initial states for a new ``theta`` that would be rejected without them."""
 ALIKE = 1e-3
-"""These steps end when none lowers a candidate's cost by more than this share."""
+"""Relative decrease of a candidate's cost below which these steps end."""
 DAMPING, WORST = 1e-3, 1e9
-"""First damping of a step, and the one with which steps are given up."""
+"""First damping, and the damping at which the iteration ends."""
 CONVERGED = 0.01
-"""A step that lowers the cost by less than this share of a window's mean cost is the last of a fit: further steps are
-far smaller than a standard error."""
+"""Decrease of the cost over a window's mean cost below which a fit ends; further steps are far smaller than a standard
+error."""
 CLOSELY = 1e-4
-"""The same share at the end of a fit: steps along a narrow valley are short."""
+"""The same at the end of a fit, because steps along a narrow valley are short."""
 SETTLING, DIGITS, SAME = 12, 1e-9, 1e-9
-"""Steps at most at the end of a fit, which end where none moves a parameter by more than this share of its half range;
-and the share by which rounding may raise the cost there."""
+"""Last steps of a fit: maximum number; change of a parameter, over its half range, below which they end; tolerated
+relative increase of the cost by rounding."""
 SHARES = 1.0, 0.5, 0.2, 0.05
-"""Shares of such a step, of which the first that does not raise the cost is taken."""
+"""Fractions of such a step; the first one that does not increase the cost is used."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +83,17 @@ class Trial:
 
 @dataclass(frozen=True)
 class _Point:
-    """Errors of the outputs at ``theta`` and first states ``x`` ``(n, n_x)``, and their Jacobians.
+    """Errors of the outputs at ``theta`` and initial states ``x`` ``(n, n_x)``, and their Jacobians.
 
-    ``error`` ``(n, (T + 1) n_y)`` is zero where nothing was measured. ``slopes`` ``(n, (T + 1) n_y, columns)`` are the
-    derivatives by ``theta`` (where asked for) and by ``x`` over its sizes. ``scale`` ``(n_y,)`` is the unit of each
-    output's errors. Errors beyond ``far`` scales cost a constant. ``held`` is the weight of a first state's distance
-    from its guess, in sizes, beside errors in scales.
+    Args:
+        theta: Parameters.
+        x: Initial states ``(n, n_x)``.
+        substeps: Runge-Kutta sub-steps a period.
+        scale: Scale of each output's errors ``(n_y,)``.
+        error: Errors ``(n, (T + 1) n_y)``; zero for missing samples.
+        slopes: Derivatives ``(n, (T + 1) n_y, columns)`` by ``theta`` (if requested), then by ``x`` over its sizes.
+        held: Weight of an initial state's squared distance from its guess, in sizes, with errors in scales.
+        far: Errors beyond this many scales have a constant cost. Default: no limit.
     """
 
     theta: Array
@@ -102,7 +111,7 @@ class _Point:
         return np.tile(self.scale, self.error.shape[1] // len(self.scale))
 
     def where(self, better: NDArray[np.bool_], other: _Point) -> _Point:
-        """Windows of the other one where it is better."""
+        """Replace windows by those of ``other`` where ``better``."""
         own, new = ((p.x, p.error, p.slopes) for p in (self, other))
         x, error, slopes = (
             np.where(better.reshape(-1, *(1 for _ in v.shape[1:])), n, v)
@@ -112,9 +121,9 @@ class _Point:
 
 
 class Shooting:
-    """Windows of outputs as a least-squares problem over ``theta`` and the first states.
+    """Windows of outputs as a least-squares problem over ``theta`` and the initial states.
 
-    ``sizes`` ``(n_x,)`` are those of the states: first states keep to their guess as if it were known to that.
+    ``sizes`` ``(n_x,)`` are the natural sizes of the states: the standard deviations of the initial guesses.
     """
 
     def __init__(
@@ -133,9 +142,9 @@ class Shooting:
         self._known: dict[bytes, tuple[float, Array]] = {}
 
     def explained(self, thetas: Sequence[Array]) -> list[float]:
-        """Root mean square error of each ``theta`` over the windows, from the first states that are best for it.
+        """Root mean square error of each ``theta`` over the windows, with the best initial states for it.
 
-        Errors are in spreads of the outputs, each at most ``FAR``. Infinite where the prior is too stiff.
+        Errors are in spreads of the outputs, each at most ``FAR``. Infinite if the prior is too stiff.
         """
         unknown: dict[int, list[Array]] = {}
         for theta in {one.tobytes(): one for one in thetas if one.tobytes() not in self._known}.values():
@@ -145,7 +154,7 @@ class Shooting:
                 self._known[theta.tobytes()] = math.inf, self.windows.x
         n = len(self.windows.x)
         share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
-        for some in unknown.values():  # all at once: windows do not know of each other
+        for some in unknown.values():  # all at once, because windows are independent
             problem = Shooting(self.own, self.windows.times(len(some)), self.sizes, self.spread)
             x = problem.windows.x
             for periods in self._growing(some):
@@ -163,8 +172,9 @@ class Shooting:
         return [self._known[theta.tobytes()][0] for theta in thetas]
 
     def _growing(self, thetas: Sequence[Array]) -> list[int]:
-        """Lengths [periods] over which first states are estimated before the whole windows, where small errors grow
-        more than a hundredfold: each estimate is the start of the next.
+        """Increasing lengths [periods] over which initial states are estimated before the whole windows.
+
+        Empty unless small errors grow by more than a factor of 100 in a window. Each estimate is the start of the next.
         """
         periods, dt = self.windows.y.shape[1] - 1, self.own.dt
         reach = min(self.own.reach(theta) for theta in thetas) / dt
@@ -173,12 +183,12 @@ class Shooting:
         return [int(own) for own in np.arange(max(reach, 4.0), periods, max(0.5 * reach, 2.0))]
 
     def first_states(self, theta: Array) -> Array:
-        """First states ``(n, n_x)`` that are best for ``theta``."""
+        """Best initial states ``(n, n_x)`` for ``theta``."""
         self.explained([theta])
         return self._known[theta.tobytes()][1]
 
     def solve(self, theta: Array, iterations: int = ITERATIONS) -> Fitted:
-        """Fit ``theta`` with the first states: errors are weighed by the spreads first, then by the residuals."""
+        """Fit ``theta`` and the initial states; errors are scaled by the spreads first, then by the residuals."""
         theta = np.clip(theta, self.own.lower, self.own.upper)
         point = self.start(theta, self.first_states(theta), "all")
         if len(theta):
@@ -199,13 +209,13 @@ class Shooting:
         keep: Sequence[int],
         free: int | None = None,
     ) -> list[Trial]:
-        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs; the worst end early.
+        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs; the worst ones end early.
 
         Args:
             thetas: Starts.
-            each: Fit for the starts of these numbers, whose windows lie one behind the other.
-            keep: How many go on after each two steps.
-            free: How many parameters are fitted, the first ones. Default: all.
+            each: Returns the fit for the starts of given numbers, whose windows lie one behind the other.
+            keep: Number of starts that continue, after each two steps.
+            free: Number of fitted parameters, from the first one on. Default: all.
         """
         alive, n = list(range(len(thetas))), len(self.windows.x)
         damping = np.full(len(thetas), DAMPING)
@@ -257,7 +267,7 @@ class Shooting:
         ]
 
     def settled(self, theta: Array) -> Fitted:
-        """The fit continued to the last digits, so that it depends on neither the start nor rounding."""
+        """Continue the fit to full convergence, so that the result depends neither on the start nor on rounding."""
         point = self.start(theta, self.first_states(theta), "all")
         for _ in range(2):
             rescaled = replace(point, scale=self._left(point.error), held=1.0)
@@ -280,7 +290,7 @@ class Shooting:
         return Fitted(point.theta, *self._covariance(point))
 
     def _along(self, point: _Point, step: Array, moved: Array) -> _Point:
-        """The point after a step; its first states are estimated anew where the cost would rise."""
+        """The point after a step; its initial states are estimated again if the cost would increase."""
         theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
         x = point.x + moved[self.windows.group] * self.sizes
         if self.windows.warm:
@@ -292,11 +302,11 @@ class Shooting:
         return self._at(point, theta, own.x, "all") if self._cost(own) <= cost * (1 + SAME) else trial
 
     def forget(self) -> None:
-        """Forget the first states that were found with other integration steps."""
+        """Clear the cached initial states, which belong to other integration steps."""
         self._known.clear()
 
     def shift(self, theta: Array, substeps: int) -> Array:
-        """How far a Gauss-Newton step moves ``theta`` where the outputs are those of so many sub-steps a period."""
+        """Change of ``theta`` by a Gauss-Newton step due to the outputs' change with ``substeps`` sub-steps a period."""
         point = self.start(theta, self.first_states(theta), "all")
         point = replace(point, scale=self._left(point.error), held=1.0)
         finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
@@ -307,15 +317,16 @@ class Shooting:
         return np.abs(moved[1] - moved[0])
 
     def start(self, theta: Array, x: Array, slopes: Slopes) -> _Point:
-        """Errors at ``theta`` from ``x``, each output's over its spread."""
+        """Point at ``theta`` and ``x``, with the outputs' spreads as scales."""
         nothing = np.zeros(0)
         substeps = self.own.most_substeps(np.atleast_2d(theta))
         empty = _Point(theta, x, substeps, self.spread, nothing, nothing, LOOSELY**2)
         return self._at(empty, theta, x, slopes)
 
     def linear(self, theta: Array, x: Array) -> tuple[Array, Array]:
-        """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` and first states ``x``, these
-        eliminated, over their scales, by the root of their robust weights.
+        """Jacobian ``(n, m, k)`` and errors ``(n, m)`` at ``theta`` and ``x``, with the initial states eliminated.
+
+        Both are over the errors' scales and times the root of the robust weights.
         """
         point = self.start(theta, x, "all")
         return self._eliminated(replace(point, scale=self._left(point.error), held=1.0))[:2]
@@ -332,7 +343,7 @@ class Shooting:
         return slopes * unit[:, None], error * unit, point.scale
 
     def _at(self, before: _Point, theta: Array, x: Array, slopes: Slopes) -> _Point:
-        """Another point."""
+        """Evaluate the outputs at another point; other fields are those of ``before``."""
         windows, seen, n, limit = self.windows, self.seen, len(x), LARGEST * self.spread
         y, by = self.own.outputs(theta, x, windows, before.substeps, slopes)
         error = np.nan_to_num(y, nan=np.inf) - np.where(seen, windows.y, 0.0)
@@ -349,14 +360,14 @@ class Shooting:
         return replace(before, theta=theta, x=x, error=error, slopes=by)
 
     def _costs(self, point: _Point) -> Array:
-        """Robust cost of each group of windows for its first state, the pull towards the guess included."""
+        """Robust cost of each group of windows for its initial state, with the distance from the guess."""
         c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
         over = np.minimum(np.abs(point.error / point.scales), point.far)
         own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
         return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
 
     def _cost(self, point: _Point) -> float:
-        """Cost of ``theta``: the sum over all windows; with a warm-up, of the samples after it."""
+        """Cost of ``theta``: sum over all windows; with a warm-up, over the samples after it."""
         if not self.windows.warm:
             return float(self._costs(point).sum()) + self._pulled(point)
         c2 = OUTLIERS**2
@@ -369,7 +380,7 @@ class Shooting:
         return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
 
     def _moved(self, point: _Point) -> Array:
-        """Distance of the first states from their guess, in sizes, times the root of its weight."""
+        """Distance of the initial states from their guess, in sizes, times the root of its weight."""
         return np.asarray(math.sqrt(point.held) * (point.x - self.windows.x) / self.sizes)
 
     def _grouped(self, values: Array) -> Array:
@@ -386,11 +397,13 @@ class Shooting:
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
         whole = np.array([float(np.sqrt(np.mean(trim_outliers(v) ** 2))) if len(v) else 0.0 for v in left])
-        robust = np.maximum(robust, COMMON * whole)  # errors that are common are the prior's, and no outliers
+        robust = np.maximum(
+            robust, COMMON * whole
+        )  # frequent errors are due to the prior; they are not outliers
         return np.maximum(robust, 1e-9 * self.spread)
 
     def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
-        """First states for a given ``theta``: Levenberg and Marquardt in each group of windows, until all converge."""
+        """Initial states for a given ``theta``: Levenberg-Marquardt steps in each group of windows, until convergence."""
         cost, eye, group = self._costs(point), np.eye(point.x.shape[1]), self.windows.group
         damping, candidates = np.full((len(cost), 1, 1), DAMPING), len(np.atleast_2d(point.theta))
         for _ in range(steps):
@@ -409,15 +422,16 @@ class Shooting:
         return point
 
     def _followed(self, point: _Point, trial: _Point) -> _Point:
-        """The trial with first states estimated anew, in each window from the trial's or the point's."""
+        """Estimate the trial's initial states again, in each window from the better one of the trial and the point."""
         moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
         still = self._at(point, trial.theta, point.x, "x")
         better = self._costs(still) < self._costs(moved)
         return self._states(moved.where(better[self.windows.group], still), FOLLOWING)
 
     def _descend(self, point: _Point, iterations: int, enough: float = CONVERGED) -> _Point:
-        """Steps of Levenberg and Marquardt of ``theta`` and first states, until one lowers the cost by less than
-        ``enough`` times a window's mean cost.
+        """Levenberg-Marquardt steps of ``theta`` and initial states.
+
+        They end when a step reduces the cost by less than ``enough`` times a window's mean cost.
         """
         damping, cost, n = DAMPING, self._cost(point), len(point.x)
         for _ in range(iterations):
@@ -428,13 +442,13 @@ class Shooting:
                 last = promised < enough * cost / n
                 theta = np.clip(point.theta + step, self.own.lower, self.own.upper)
                 x = point.x + moved[self.windows.group] * self.sizes
-                if self.windows.warm:  # the warm-up tells the first states of every theta
+                if self.windows.warm:  # the warm-up determines the initial states for every theta
                     x = self._states(self._at(point, theta, x, "x")).x
                 trial = self._at(point, theta, x, "all")
                 new = self._cost(trial)
                 if not (
                     new < cost or last or followed or self.windows.warm
-                ):  # first states may not have followed
+                ):  # initial states may not fit the new theta yet
                     followed = True
                     own = self._followed(point, trial)
                     if self._cost(own) < cost:
@@ -452,14 +466,17 @@ class Shooting:
         return point
 
     def _weighted(self, point: _Point) -> Array:
-        """Jacobian and, as the last column, errors: over their scale and times the root of their robust weight."""
+        """Jacobian and (last column) errors, over the scales and times the root of the robust weights.
+
+        The weight of a residual r is ``1 / sqrt(1 + (r / OUTLIERS)^2)``, and 0 beyond ``far``.
+        """
         error = point.error / point.scales
         root = np.where(np.abs(error) < point.far, (1 + np.square(error / OUTLIERS)) ** -0.25, 0.0)
         slopes = point.slopes * (root / point.scales)[..., None]
         return np.concatenate([slopes, (root * error)[..., None]], axis=-1)
 
     def _normal(self, point: _Point) -> tuple[Array, ...]:
-        """Blocks of the normal equations: of ``x`` and of both by groups, of ``theta``, and the gradients."""
+        """Blocks of the normal equations: ``xx`` and ``xt`` by group, ``tt``, and the gradients."""
         rows, n_x = self._weighted(point) * np.sqrt(self.tell)[:, None], point.x.shape[1]
         every = rows.swapaxes(1, 2) @ rows
         t, x = slice(0, -1 - n_x), slice(-1 - n_x, -1)
@@ -473,15 +490,18 @@ class Shooting:
         )  # fmt: skip
 
     def _pull(self, point: _Point, n: int) -> tuple[Array, Array]:
-        """The pull towards the nominal values: its part of the normal matrix and of the gradient."""
-        if not n:  # of the first states alone
+        """Part of the normal matrix and of the gradient that pulls ``theta`` towards the nominal values."""
+        if not n:  # initial states alone
             return np.zeros((0, 0)), np.zeros(0)
         weights = np.square(self.own.pull)
         return np.diag(weights), weights * (point.theta - self.own.nominal)
 
     def _eliminated(self, point: _Point) -> tuple[Array, Array, Array, float]:
-        """Jacobian by ``theta`` and errors that count, first states eliminated; how first states follow ``theta``, and
-        the degrees of freedom that they take.
+        """Jacobian of the counted errors with respect to ``theta``, and these errors, with initial states eliminated.
+
+        Returns:
+            Jacobian, errors, derivative of the initial states by ``theta`` (last column: their Gauss-Newton step), and
+            the degrees of freedom of the initial states.
         """
         rows, n_x = self._weighted(point), point.x.shape[1]
         b, a, error = rows[..., : -1 - n_x], rows[..., -1 - n_x : -1], rows[..., -1:]
@@ -509,8 +529,9 @@ class Shooting:
         )  # fmt: skip
 
     def _step(self, normal: tuple[Array, ...], damping: float, theta: Array) -> tuple[Array, Array, float]:
-        """Step of ``theta`` within its bounds, step of the first states by groups, and the decrease of the cost to
-        first order.
+        """Step of ``theta`` within its bounds, step of the initial states by group, and first-order cost decrease.
+
+        The Schur complement eliminates x: ``(tt - tx xx^-1 xt) dtheta = -(gt - tx xx^-1 gx)``.
         """
         xx, xt, tt, gx, gt = normal
         reduced, slope = tt, gt
@@ -530,7 +551,7 @@ class Shooting:
         return step, moved, -2.0 * (float(gt @ step) + of_states)
 
     def _covariance(self, point: _Point) -> tuple[Array, tuple[Combination, ...]]:
-        """Covariance of ``theta``, and what the windows do not identify."""
+        """Covariance of ``theta``, and the combinations that are not identifiable."""
         slopes, error, _, taken = self._eliminated(point)
         falling = 1.0 / (1.0 + np.square(point.error / point.scales / OUTLIERS))  # psi'(r) over psi(r) / r
         counted = float((self.seen.reshape(len(slopes), -1) * self.count).sum())
@@ -538,10 +559,11 @@ class Shooting:
 
 
 def _bounded(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
-    """Step ``(n,)`` to the least of ``s' matrix s / 2 + slope' s`` between ``low <= 0`` and ``high >= 0``.
+    """Step ``s`` ``(n,)`` that reduces ``s' matrix s / 2 + slope' s`` within ``low <= 0`` and ``high >= 0``.
 
-    Of the components that would go beyond, the first one to meet its bound is held there, and the others are solved for
-    anew: held together, two that lie along a valley would both rest in a corner. None is let go of again.
+    Of the components that would leave their bounds, the first one to reach its bound is fixed there, and the others are
+    solved again. (Fixing all of them at once could stop two components along a valley in a corner.) A fixed component
+    is not released again.
     """
     step, free = np.zeros(len(slope)), np.arange(len(slope))
     held = np.zeros(len(slope), dtype=bool)
@@ -559,6 +581,6 @@ def _bounded(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
 
 
 def _regular(xx: Array, held: float) -> Array:
-    """Normal matrices of first states ``(n, n_x, n_x)`` with what holds these at their guess."""
+    """Normal matrices of initial states ``(n, n_x, n_x)`` with the weight ``held`` of the distance from their guess."""
     eye = np.eye(xx.shape[-1])
     return np.asarray(xx * (1.0 + ROUNDING * eye) + held * eye)

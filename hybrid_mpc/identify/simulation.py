@@ -1,7 +1,7 @@
-"""Free runs of a prior over many windows at once, with exact sensitivities: one graph of scalar operations.
+"""Free runs of a prior over many windows at once, with exact sensitivities.
 
-The prior is traced once. A period is a Runge-Kutta step and the outputs at its begin, beside their derivatives by the
-state and the parameters; each of its operations runs over all windows at once.
+The prior is traced once to a graph of scalar operations. A period consists of a Runge-Kutta step, the outputs at its
+start, and their derivatives by state and parameters. Each operation is vectorized over all windows.
 """
 
 from __future__ import annotations
@@ -24,28 +24,27 @@ from nn_export.vectorised import vectorised
 
 Array = NDArray[np.float64]
 MAX_SUBSTEPS = 20
-"""A prior stiffer than this many Runge-Kutta sub-steps a period can follow needs another dt."""
+"""Maximum Runge-Kutta sub-steps a period; a stiffer prior needs a smaller dt."""
 USUALLY = 0.98
-"""Share of the samples at which a prior must not be too stiff: an edge that is touched now and then, such as the root
-of an empty tank's level, is integrated as well as can be."""
+"""Share of the samples at which a prior must not be too stiff. At the others, such as the square root of an empty tank's
+level, the integration is less accurate."""
 VISITED = 200
-"""Samples of the recordings that are asked how stiff the prior is there, beside the outermost ones."""
+"""Number of samples of the recordings at which the stiffness is computed, besides the extreme ones."""
 CHAINED = 20
-"""Periods of a recursion that one call evaluates: calls from Python take as long as some hundred operations."""
+"""Periods of a recursion in one call: a call from Python takes as long as some hundred operations."""
 Points: TypeAlias = tuple[Array, Array, Array]
 """States ``(n, n_x)``, inputs ``(n, n_u)`` and disturbances ``(n, n_w)``."""
 
 
 class Simulation:
-    """Free runs of an ODE, as functions of its first states, its inputs and its parameters.
+    """Free runs of an ODE, as functions of initial states, inputs and parameters.
 
     Args:
-        xdot: ``(x, u, w, p) -> xdot`` of scalar operations, as :class:`~hybrid_mpc.machine.prior.Equations` has it.
+        xdot: ``(x, u, w, p) -> xdot`` of scalar operations, as in :class:`~hybrid_mpc.machine.prior.Equations`.
         dt: Period [s].
-        free: Places in ``p`` of the parameters by which it is differentiated, in this order.
-        output: ``(x, u, w, p) -> y``, what is asked for at every sample. Default: the states.
-        correct: ``(x, u, w, p) -> x``, the state from which a period starts, by what is known at its begin. Default:
-            the state itself.
+        free: Indices in ``p`` of the parameters for the derivatives, in this order.
+        output: ``(x, u, w, p) -> y``, the result at every sample. Default: the states.
+        correct: ``(x, u, w, p) -> x``, correction of the state at the start of a period. Default: none.
     """
 
     def __init__(
@@ -61,10 +60,10 @@ class Simulation:
         self._period = cache(self._period_function)
 
     def values(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> Array:
-        """Outputs ``(n, T + 1, n_y)`` of runs from ``x0`` ``(n, n_x)`` under ``u`` ``(n, T + 1, n_u)``, ``w`` ``(n, T +
-        1, n_w)``, of which the last sample is for the outputs.
+        """Outputs ``(n, T + 1, n_y)`` of runs from ``x0`` ``(n, n_x)``.
 
-        Parameters ``p`` are those of all runs ``(n_p,)``, or of each ``(n, n_p)``.
+        ``u`` is ``(n, T + 1, n_u)``, ``w`` ``(n, T + 1, n_w)``; their last sample is used for the outputs only.
+        Parameters ``p`` are ``(n_p,)`` for all runs, or ``(n, n_p)``.
         """
         return self._run(x0, u, w, p, substeps, 0)[0]
 
@@ -73,7 +72,7 @@ class Simulation:
         return self._run(x0, u, w, p, substeps, len(self.free))
 
     def by_all(self, x0: Array, u: Array, w: Array, p: Array, substeps: int) -> tuple[Array, Array]:
-        """The same outputs, and their derivatives by the free parameters and, behind these, by the first state."""
+        """The same outputs, and their derivatives by the free parameters, then by the initial state."""
         return self._run(x0, u, w, p, substeps, len(self.free) + self.n_x)
 
     def _run(
@@ -90,7 +89,7 @@ class Simulation:
         return np.ascontiguousarray(y[:, :, 0]), np.ascontiguousarray(y[:, :, 1:].swapaxes(2, 3))
 
     def _period_function(self, substeps: int, columns: int) -> ca.Function:
-        """A period ``(z, u, w, p) -> z, y`` with ``z = [x, columns of derivatives]``, and ``y`` in the same way."""
+        """A period ``(z, u, w, p) -> z, y`` with ``z = [x, columns of derivatives]``; ``y`` has the same form."""
         n_u, n_w = self._xdot.size1_in(1), self._xdot.size1_in(2)
         sizes = {"z": (self.n_x, 1 + columns), "u": (n_u, 1), "w": (n_w, 1), "p": (self.n_p, 1)}
         z, u, w, p = (ca.SX.sym(name, *size) for name, size in sizes.items())
@@ -105,7 +104,7 @@ class Simulation:
         begin = given if correct is None else correct(given, u, w, p)
         found = []
         for value in (stepped(rate, begin, u, w, p, self.dt, substeps), y):
-            if columns:  # by the first state of the run: what this period does to the columns
+            if columns:  # chain rule: derivatives of this period times those of the periods before
                 slopes = value[:, 1 + n :] @ z[:, 1:]
                 slopes[:, :n] += value[:, 1 : 1 + n]
                 value = ca.horzcat(value[:, 0], slopes)
@@ -114,15 +113,15 @@ class Simulation:
 
 
 def _with_slopes(f: ca.Function, free: Sequence[int], wanted: bool) -> Callable[..., ca.SX]:
-    """``f(x, u, w, p)`` of ``z = [x, derivatives by free parameters, derivatives by a first state]``, in the same form.
+    """``f(x, u, w, p)`` for ``z = [x, derivatives by free parameters, derivatives by an initial state]``.
 
-    A Runge-Kutta step of these rates is the step of ``x`` and its exact derivative. The Jacobians are expressions of
-    one stage, and sparse: most steps have fewer operations than one that is differentiated as a whole.
+    The result has the same form. A Runge-Kutta step of these rates is the step of ``x`` and its exact derivative. The
+    Jacobians are sparse expressions of one stage, so the step has fewer operations than the derivative of a whole step.
 
     Args:
         f: The function.
-        free: Places of the free parameters in ``p``.
-        wanted: Whether there are derivatives; ``z`` is ``x`` otherwise.
+        free: Indices of the free parameters in ``p``.
+        wanted: True: with derivatives; False: ``z`` is ``x``.
     """
     x, u, w, p = (ca.SX.sym(f.name_in(i), f.size1_in(i)) for i in range(4))
     value, n = f(x, u, w, p), len(free)
@@ -143,23 +142,23 @@ def _with_slopes(f: ca.Function, free: Sequence[int], wanted: bool) -> Callable[
 def simulation_of(
     xdot: ca.Function, dt: float, free: tuple[int, ...] = (), output: ca.Function | None = None
 ) -> Simulation:
-    """The same :class:`Simulation` whenever it is asked for: its functions are built once."""
+    """Cached :class:`Simulation`; its functions are built once."""
     return Simulation(xdot, dt, free, output)
 
 
 def over_time(
     period: ca.Function, first: Array, signals: Sequence[Array], constants: Sequence[Array]
 ) -> tuple[Array, list[Array]]:
-    """A recursion ``z_{k+1}, others_k = period(z_k, signals_k, constants)`` of ``n`` runs side by side.
+    """Evaluate the recursion ``z_{k+1}, others_k = period(z_k, signals_k, constants)`` for ``n`` parallel runs.
 
-    The runs are the last axis: an operation of the period is one of CasADi's machine for all of them, on numpy's own
-    memory. Elements of an argument or result come column by column.
+    Runs are the last axis. Each operation is vectorized over all runs, on numpy's memory. Matrix arguments and results
+    are stored column by column.
 
     Args:
         period: The function, of scalar operations.
         first: ``z_0`` ``(..., n)``.
-        signals: Arguments by time ``(T, size, n)``.
-        constants: Arguments that stay ``(..., n)``.
+        signals: Time-varying arguments ``(T, size, n)``.
+        constants: Constant arguments ``(..., n)``.
 
     Returns:
         ``z`` ``(T + 1, size, n)``, and each of the others ``(T, size, n)``.
@@ -189,7 +188,7 @@ def over_time(
 
 @lru_cache(maxsize=128)
 def _side_by_side(period: ca.Function, signals: int, n: int) -> ca.Function:
-    """``(z, signals, constants) -> z, others`` of ``n`` runs, each of them one matrix."""
+    """``(z, signals, constants) -> z, others`` for ``n`` runs; each argument and result is one matrix."""
     kinds = [range(1), range(1, 1 + signals), range(1 + signals, period.n_in())]
     sizes = [[period.numel_in(i) for i in kind] for kind in kinds]
     given = [ca.SX.sym("v", sum(own)) for own in sizes]
@@ -205,7 +204,7 @@ def _side_by_side(period: ca.Function, signals: int, n: int) -> ca.Function:
 
 @lru_cache(maxsize=128)
 def _chained(one: ca.Function) -> ca.Function:
-    """``CHAINED`` periods as one function, what each of them gives side by side: few calls from Python."""
+    """``CHAINED`` periods as one function, to reduce the number of calls from Python."""
     z, constants = ca.MX.sym("z", *one.size_in(0)), ca.MX.sym("c", *one.size_in(2))
     signals = ca.MX.sym("s", one.size1_in(1), CHAINED * one.size2_in(1))
     found, after = [], z
@@ -219,7 +218,7 @@ def _chained(one: ca.Function) -> ca.Function:
 def stepped(
     xdot: Callable[..., ca.SX], x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, dt: float, substeps: int
 ) -> ca.SX:
-    """The state a period later, by Runge-Kutta of order 4 in equal sub-steps; ``u`` and ``w`` are held."""
+    """State one period later, by the Runge-Kutta method of order 4 in equal sub-steps; ``u`` and ``w`` are constant."""
     s = dt / substeps
     for _ in range(substeps):
         k1 = xdot(x, u, w, p)
@@ -232,7 +231,7 @@ def stepped(
 
 @lru_cache(maxsize=32)
 def with_unknown_rates(xdot: ca.Function, corrected: tuple[int, ...]) -> ca.Function:
-    """``xdot`` of ``(x, d)``: the rates of the corrected states have an unknown, constant ``d`` added to them."""
+    """``xdot`` of ``(x, d)``: the rates of the corrected states have unknown, constant rates ``d`` added."""
     n_x, n_d = xdot.size1_in(0), len(corrected)
     z = ca.SX.sym("z", n_x + n_d)
     u, w, p = (ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in (1, 2, 3))
@@ -244,15 +243,15 @@ def with_unknown_rates(xdot: ca.Function, corrected: tuple[int, ...]) -> ca.Func
 
 
 def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> int:
-    """Sub-steps a period that keep every eigenvalue of the prior within 1 / sub-step: at rest, and at points.
+    """Number of sub-steps a period so that |eigenvalue| times sub-step is at most 1, at rest and at points.
 
-    Rest is the operating point, or else the middle of the signals' ranges (:func:`rest_of`). Points are where the
-    machine was (:func:`visited`); modes that grow there do not count: no number of sub-steps holds them. A few points
-    that would need more than ``MAX_SUBSTEPS`` get these. Runge-Kutta
-    of order 4 is stable up to 2.8 and accurate to per cents of the fast mode at 1.
+    Rest is the operating point, or the middle of the signals' ranges (:func:`rest_of`). Points are samples of the
+    recordings (:func:`visited`); unstable modes are ignored there. At most 2 % of the points may need more than
+    ``MAX_SUBSTEPS``; these points get ``MAX_SUBSTEPS``. The Runge-Kutta method of order 4 is stable up to 2.8, and its
+    error at 1 is a few per cent of the fast mode.
 
     Raises:
-        InputError: If that is more than ``MAX_SUBSTEPS``.
+        InputError: If more than ``MAX_SUBSTEPS`` are needed.
     """
     name = f"{type(prior).__name__}: the prior"
     substeps = substeps_for(prior.equations.xdot, *rest_of(prior), prior.p, dt, name)
@@ -267,10 +266,10 @@ def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> 
 
 
 def growth_rate(prior: Prior, points: Points) -> float:
-    """Mean rate [1/s] at which two runs of the prior part where the recordings go; 0 where they do not.
+    """Mean growth rate [1/s] of the distance of two runs of the prior along the recordings; 0 for a stable prior.
 
-    It is the mean over the points of the largest real part of an eigenvalue that is positive: what a swing passes in a
-    moment counts little, what holds throughout counts whole.
+    Mean over the points of the largest real part of an eigenvalue, or zero if that is negative. A short passage through
+    an unstable region counts in proportion to its duration.
     """
     if not len(points[0]):
         return 0.0
@@ -279,9 +278,9 @@ def growth_rate(prior: Prior, points: Points) -> float:
 
 
 def visited(trajectories: Sequence[Trajectory]) -> Points:
-    """States, inputs and disturbances where the machine was: some samples, evenly chosen, and the outermost ones.
+    """States, inputs and disturbances at evenly chosen samples of the recordings, and at the extreme samples.
 
-    They decide how stiff a prior is that is stiff in a part of its range alone.
+    They determine the stiffness of a prior that is stiff only in a part of its range.
     """
     columns = [np.concatenate([getattr(t, key) for t in trajectories]) for key in ("x", "u", "w")]
     every = np.hstack(columns)[np.isfinite(np.hstack(columns)).all(axis=1)]
@@ -293,9 +292,9 @@ def visited(trajectories: Sequence[Trajectory]) -> Points:
 
 
 def rest_of(prior: Prior) -> tuple[Array, Array, Array]:
-    """States, inputs and disturbances at the operating point, or else in the middle of their ranges.
+    """States, inputs and disturbances at the operating point, or in the middle of their ranges.
 
-    What has no range is zero, or the limit next to it.
+    A signal without a finite range is zero, or its limit nearest to zero.
     """
     signals = prior.states, prior.inputs, prior.disturbances
     nearest = [np.array([_middle(s) for s in group], dtype=np.float64) for group in signals]
@@ -311,7 +310,7 @@ def _middle(signal: Signal) -> float:
 
 
 def substeps_for(xdot: ca.Function, x: Any, u: Any, w: Any, p: Any, dt: float, name: str) -> int:
-    """:func:`required_substeps` of any ``xdot(x, u, w, p)`` at a point; an error says that ``name`` is too stiff."""
+    """:func:`required_substeps` of any ``xdot(x, u, w, p)`` at a point; ``name`` is for the error message."""
     slope = flow_slope(xdot)(x, u, w, p).full()
     rate = float(np.abs(np.linalg.eigvals(slope)).max()) if np.isfinite(slope).all() else math.inf
     return _substeps(rate, dt, name, "at rest")
@@ -329,7 +328,7 @@ def _substeps(rate: float, dt: float, name: str, where: str) -> int:
 
 
 def _flow_slopes(prior: Prior, points: Points) -> Array:
-    """Derivatives of the rates by the state at those points where they are finite ``(m, n_x, n_x)``."""
+    """Jacobians of the rates by the state ``(m, n_x, n_x)``, at the points with finite Jacobians."""
     slopes = _slopes_at(prior.equations.xdot, len(points[0]))(*(v.T for v in points), prior.p).full()
     every = np.moveaxis(slopes.reshape(len(prior.states), -1, len(prior.states)), 1, 0)
     return np.asarray(every[np.isfinite(every).all(axis=(1, 2))])
@@ -342,6 +341,6 @@ def _slopes_at(xdot: ca.Function, n: int) -> ca.Function:
 
 @lru_cache(maxsize=32)
 def flow_slope(xdot: ca.Function) -> ca.Function:
-    """``(x, u, w, p)`` to the derivative of ``xdot`` by ``x`` ``(n_x, n_x)``."""
+    """Function of ``(x, u, w, p)``: Jacobian of ``xdot`` by ``x`` ``(n_x, n_x)``."""
     point = [ca.SX.sym(xdot.name_in(i), xdot.size1_in(i)) for i in range(4)]
     return ca.Function("slope", point, [ca.densify(ca.jacobian(xdot(*point), point[0]))])

@@ -46,9 +46,8 @@ UNITS = 3
 """Units of a parameter that a cell shows at most."""
 HEAD = """# Terms
 
-The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search to some of them.
-`hm.terms.LAW(...)` makes one for a prior of your own
-([mechanical machines and terms](mechanical-priors.md#friction-and-other-terms)).
+The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search. `hm.terms.LAW(...)` makes
+a term for [a prior of your own](mechanical-priors.md#friction-and-other-terms).
 
 | symbol | meaning |
 | --- | --- |
@@ -57,10 +56,7 @@ The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` lim
 | `s` | state of the term itself |
 
 An *axis* is a pair of states, a position and its speed. *Other rates* are those of other states that a network may
-correct. A potential acts as the force `-dV/dq`. Bounds and scales of the parameters follow from the recordings.
-
-The units are examples: a turning axis (rad), a sliding axis (m), a level (m), a temperature (degC), inputs in V. Angles
-have no unit within a term.
+correct. A potential acts as the force `-dV/dq`. Units are examples; angles have no unit within a term.
 
 This page is generated: `python -m hybrid_mpc.identify.term_table > docs/terms.md`.
 """
@@ -100,13 +96,24 @@ def document() -> str:
     units, parts = _units(), [HEAD]
     for title, laws in GROUPS.items():
         parts.append(
-            f"## {title}\n\n| law | what it is | equation | units | tried for |\n| --- | --- | --- | --- | --- |"
+            f"## {title}\n\n{_tried(laws)}\n\n| law | what it is | equation | units |\n| --- | --- | --- | --- |"
         )
-        for law, where in laws.items():
-            cells = [f"`{law}`", terms.EXPLANATIONS[law], equation(law), "; ".join(units[law]), where]
+        for law in laws:
+            cells = [f"`{law}`", terms.EXPLANATIONS[law], equation(law), "; ".join(units[law])]
             parts.append(f"| {' | '.join(cells)} |")
         parts.append("")
     return "\n".join(parts)
+
+
+def _tried(laws: Mapping[str, str]) -> str:
+    """What the laws of a table are tried for, the most common one first."""
+    by: dict[str, list[str]] = {}
+    for law, where in laws.items():
+        by.setdefault(where, []).append(f"`{law}`")
+    common = max(by, key=lambda where: len(by[where]))
+    others = [f"{', '.join(names)} for {where}" for where, names in by.items() if where != common]
+    exceptions = f" Exceptions: {'; '.join(others)}." if others else ""
+    return f"`explain` tries these laws for {common}.{exceptions}"
 
 
 def equation(law: str) -> str:

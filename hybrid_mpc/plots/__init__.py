@@ -1,7 +1,8 @@
-"""Figures: one module a domain, plain arrays in, matplotlib figures out. No torch in here.
+"""Figures: functions that take plain arrays and return matplotlib figures. This package never imports torch.
 
-The domains are ``data``, ``fit``, ``loops``, ``animation``, ``estimation``, ``monitor``, ``analysis``, ``tune`` and
-``studies``; ``style`` has what they share: colours, names, panels, legends, saving. Figures are imported when used.
+Each domain has a module: ``data``, ``fit``, ``explain``, ``loops``, ``animation``, ``estimation``, ``monitor``,
+``analysis``, ``tune`` and ``studies``. ``style`` holds the shared parts: colours, names, panels, legends and saving.
+A module is imported when one of its figures is used.
 """
 
 import importlib

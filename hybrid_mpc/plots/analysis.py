@@ -1,4 +1,4 @@
-"""Figures of the linear analysis: poles, frequency and step responses, loops, gain schedules, friction, parameters."""
+"""Figures of the linear analysis: poles, frequency and step responses, sensitivities, gain schedules, friction."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ _POINTS = {
 
 
 def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | None = None) -> Figure:
-    """Poles (and zeros) of the linearized models in the z-plane; right, the slow ones near z = 1 enlarged.
+    """Poles (and zeros) of the linearized models in the z-plane; the right panel enlarges the slow poles near z = 1.
 
     Args:
         poles: Eigenvalues ``(n,)``, complex, of each model's one-step map.
         dt: Model period [s]; sets the natural frequencies of the grid.
-        zeros: Zeros ``(n,)``, complex, by model: then poles are crosses and zeros circles, and the title counts zeros
-            that lie outside of the frame. Default: none, and the markers tell the models apart.
+        zeros: Zeros ``(n,)``, complex, by model. Poles are then crosses and zeros circles, and the title counts the
+            zeros outside the frame. Default: none; the markers separate the models.
 
     Raises:
-        InputError: If there is no pole or ``dt`` is not positive.
+        InputError: If there is no pole, or ``dt`` is not positive.
 
     Example:
         >>> len(pole_map({"phy": [0.9 + 0.1j, 0.9 - 0.1j]}, 0.02).axes)
@@ -64,7 +64,9 @@ def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | 
     values = {m: np.ravel(np.asarray(p, dtype=complex)) for m, p in poles.items()}
     nulls = {m: np.ravel(np.asarray(z, dtype=complex)) for m, z in (zeros or {}).items()}
     if not dt > 0 or not any(len(p) for p in values.values()):
-        raise InputError(f"pole map: needs at least one pole and a positive dt, got dt = {dt} [HM-PLOTS-001]")
+        raise InputError(
+            f"pole map: at least one pole and a positive dt are needed, got dt = {dt} [HM-PLOTS-001]"
+        )
     figure, axes = new_figure(1, 2, size=(10, 5.4))
     extent = max(1.08, *(1.05 * float(np.abs(p).max()) for p in values.values() if len(p)))
     near = np.concatenate([p[np.abs(p - 1.0) < 0.35] for p in values.values()])
@@ -92,7 +94,7 @@ def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | 
     away = sum(int(np.sum(np.maximum(np.abs(z.real), np.abs(z.imag)) > extent)) for z in nulls.values())
     outside = f", {away} zero{'s' * (away != 1)} outside of the frame" if away else ""
     title_axes(whole, f"z-plane, stable inside the circle{outside}\n" + grid.format(0.1 * np.pi / dt))
-    title_axes(zoom, "the frame enlarged: slow poles near z = 1\n" + grid.format(_round(half / dt / 5)))
+    title_axes(zoom, "enlarged: slow poles near z = 1\n" + grid.format(_round(half / dt / 5)))
     shared_legend(figure)
     return figure
 
@@ -105,7 +107,7 @@ def _points(ax: Axes, model: str, z: Any, marker: str, label: str) -> None:
 
 
 def _half_width(near: Any) -> float:
-    """Size of the enlarged frame [1 - h, 1 + 0.35 h] x [-0.675 h, 0.675 h] that holds all these poles."""
+    """Size h of the enlarged frame [1 - h, 1 + 0.35 h] x [-0.675 h, 0.675 h] that holds all these poles."""
     if not len(near):
         return 0.3
     d = near - 1.0
@@ -114,16 +116,21 @@ def _half_width(near: Any) -> float:
 
 
 def _round(value: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten below ``value``."""
+    """Largest of 1, 2 or 5 times a power of ten that is at most ``value``."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(max(step for step in (1.0, 2.0, 5.0) if step <= value / power + 1e-9) * power)
 
 
 def _z_grid(ax: Axes, dt: float, spacing: float, reach: float) -> None:
+    """Draw the unit circle and lines of constant damping ratio and natural frequency ``spacing`` [rad/s].
+
+    A pole ``s = omega_n (-zeta + i sqrt(1 - zeta^2))`` of a continuous system is ``z = exp(s dt)``. Each damping ratio
+    is written at the distance ``reach`` from z = 1.
+    """
     ax.grid(False)
     angle = np.linspace(0.0, 2.0 * np.pi, 721)
     ax.plot(np.cos(angle), np.sin(angle), color="black", linewidth=1.2)
-    for damping in _DAMPING:
+    for damping in _DAMPING:  # omega = omega_n dt, up to a damped frequency of pi
         omega = np.linspace(0.0, np.pi / np.sqrt(1.0 - damping**2), 2000)
         z = np.exp(omega * (-damping + 1j * np.sqrt(1.0 - damping**2)))
         for side in (z, z.conj()):
@@ -151,14 +158,14 @@ def bode(
     """Frequency responses of the linearized models from one input to one output: magnitude and phase.
 
     Args:
-        responses: By model, or by names of your own: angular frequencies ``(n,)`` [rad/s], magnitude ``(n,)`` [output
+        responses: By model or any other name: angular frequencies ``(n,)`` [rad/s], magnitude ``(n,)`` [output
             unit / input unit], phase ``(n,)`` [rad].
         input_signal: The input.
         output_signal: The output.
-        nyquist: Highest meaningful frequency ``pi / dt`` [rad/s]; drawn as a line. Default: none.
+        nyquist: Nyquist frequency ``pi / dt`` [rad/s]; drawn as a line. Default: none.
 
     Raises:
-        InputError: If there is no model or lengths differ.
+        InputError: If there is no model, or lengths differ.
 
     Example:
         >>> omega = np.array([0.1, 1.0, 10.0])
@@ -180,7 +187,7 @@ def bode(
             line["color"] = _COLOURS[unknown.index(model) % len(_COLOURS)]
         size = checked(f"magnitude of {model}", magnitude, len(omega))
         angle = np.degrees(checked(f"phase of {model}", phase, len(omega)))
-        # at the Nyquist frequency itself a sampled response is real: its size may vanish, its phase jump
+        # at the Nyquist frequency a sampled response is real: its magnitude may vanish and its phase may jump
         clear = omega < (np.inf if nyquist is None else 0.98 * nyquist)
         magnitude_ax.loglog(omega, size, **line)
         phase_ax.semilogx(omega[clear], angle[clear], **line)
@@ -207,11 +214,11 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, NDArray[Any]]]) -> Fi
     """Sensitivity and complementary sensitivity of loops at the plant's input.
 
     Args:
-        loops: By loop: ``omega`` ``(n,)`` [rad/s], complex ``S`` and ``T`` ``(n,)``. Names that differ after their last
-            comma only (``"prior on prior, quiet"``) share a colour.
+        loops: By loop: ``omega`` ``(n,)`` [rad/s], complex ``S`` and ``T`` ``(n,)``. Names that differ only after their
+            last comma (``"prior on prior, quiet"``) share a colour.
 
     Raises:
-        InputError: If there is no loop or lengths differ.
+        InputError: If there is no loop, or lengths differ.
 
     Example:
         >>> one = {"omega": np.array([1.0, 2.0]), "S": np.array([0.5 + 0j, 1.0]), "T": np.array([0.5 + 0j, 0.0])}
@@ -221,7 +228,7 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, NDArray[Any]]]) -> Fi
     if not loops:
         raise InputError("sensitivity functions: there is no loop to draw [HM-PLOTS-003]")
     figure, axes = new_figure(1, 2, sharex=True, sharey=True, size=(10, 4.2))
-    texts = ("S: what is left of a load", "T: what the input takes of it")
+    texts = ("S: remaining part of an input load", "T: part compensated by the input")
     looks = _looks(loops)
     for ax, key, text in zip(axes[0], "ST", texts, strict=True):
         for name, one in loops.items():
@@ -240,7 +247,7 @@ def sensitivity_functions(loops: Mapping[str, Mapping[str, NDArray[Any]]]) -> Fi
 
 
 def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Colours by what stands before the last comma of a name (the loop), dashes by what follows it (its filter)."""
+    """Line styles: the part of a name before its last comma (the loop) sets the colour, the rest sets the dashes."""
     loops: list[str] = []
     variants: list[str] = []
     looks = {}
@@ -259,12 +266,12 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def nyquist(loops: Mapping[str, NDArray[np.complex128]], *, modulus: float | None = None) -> Figure:
-    """Nyquist curves of loops in negative-feedback sign, around -1.
+    """Nyquist curves of loops near the point -1, for negative feedback.
 
     Args:
         loops: By loop: complex loop gain ``(n,)`` along increasing frequency; names as in
             :func:`sensitivity_functions`.
-        modulus: Radius of a circle around -1 to draw, e.g. the smallest distance wanted. Default: none.
+        modulus: Radius of a circle around -1, for example the required modulus margin. Default: none.
 
     Raises:
         InputError: If there is no loop.
@@ -307,7 +314,8 @@ def gain_schedules(
     """LQR gains of the physical states over the position.
 
     Args:
-        schedules: By model, then by point (``"rest"``, ``"working"``): positions ``(n,)`` and gains ``(n, n_x)``.
+        schedules: By model, then by point of linearization (``"rest"``, ``"working"``): positions ``(n,)`` and gains
+            ``(n, n_x)``.
         position: The position.
         states: Signals of the states.
         input_signal: The input.
@@ -344,16 +352,16 @@ def gain_schedules(
 def measured_bode(
     responses: Mapping[str, Mapping[str, Array]], *, input_signal: Signal, output_signal: Signal, source: str
 ) -> Figure:
-    """Frequency responses estimated in the same way from a machine and from models.
+    """Frequency responses of a machine and of models, all estimated with the same method.
 
-    Lines that are not trusted are drawn faint, and their phase is not: it would be any.
+    Frequencies without a significant coherence are drawn faint and without phase, because their phase is arbitrary.
 
     Args:
         responses: By name (``"measured"`` for the machine): ``omega`` [rad/s], complex ``response``, ``coherence``,
-            ``deviation`` of the magnitude, and whether a line is ``trusted``, each ``(n,)``.
+            standard ``deviation`` of the magnitude, and whether a frequency is ``trusted``, each ``(n,)``.
         input_signal: The input.
         output_signal: The output.
-        source: What was done, for the title.
+        source: Excitation and data, for the title.
 
     Raises:
         InputError: If there is no response.
@@ -393,7 +401,7 @@ def measured_bode(
         middle.semilogx(w, phase, **style)
         lower.semilogx(w, np.where(sure, there, np.nan), **style)
     if doubtful:
-        text = "faint, without phase: coherence no higher than that of unrelated signals"
+        text = "faint, without phase: coherence not higher than that of unrelated signals"
         lower.plot([], [], color=INK, alpha=0.2, label=text)
     upper.set_ylabel(f"magnitude\n[{ratio_unit(output_signal, input_signal)}]")
     middle.set_ylabel("phase [°]")
@@ -412,7 +420,7 @@ def measured_bode(
 def step_responses(
     curves: Mapping[str, Mapping[str, tuple[Array, Array]]], *, input_signal: Signal, output_signal: Signal
 ) -> Figure:
-    """Unit step responses of linearizations, a panel a point of linearization.
+    """Unit step responses of linearizations, one panel for each point of linearization.
 
     Args:
         curves: By point (``"rest"``), then by model: times ``(n,)`` [s] and output per unit of the input ``(n,)``.
@@ -420,7 +428,7 @@ def step_responses(
         output_signal: The output.
 
     Raises:
-        InputError: If there is nothing to draw or lengths differ.
+        InputError: If there is nothing to draw, or lengths differ.
 
     Example:
         >>> t = np.linspace(0.0, 1.0, 5)
@@ -442,10 +450,11 @@ def step_responses(
 
 
 def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed: float, unit: str) -> Figure:
-    """How much damping a motion of some size feels: slope at rest, chords, slope in motion.
+    """Equivalent damping of the friction over the speed: tangent at rest, secant, describing function, tangent.
 
     Args:
-        curves: By model: ``speed``, ``secant``, ``harmonic``, ``moving`` ``(n,)`` and ``tangent``, a number [1/s].
+        curves: By model: ``speed`` ``(n,)``; ``secant``, ``harmonic`` (describing function) and ``moving`` (tangent in
+            motion) ``(n,)`` [1/s]; ``tangent`` at rest, a number [1/s].
         working_speed: Working speed, drawn as a line.
         unit: Unit of the speed.
 
@@ -483,29 +492,29 @@ def friction_damping(curves: Mapping[str, Mapping[str, Array]], *, working_speed
             color=MUTED,
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
         )
-        ax.set_xlabel(f"size of the speed [{unit}]")
+        ax.set_xlabel(f"amplitude of the speed [{unit}]")
         title_axes(ax, name_of(name))
         plain_log(ax.xaxis, float(speed.min()), float(speed.max()))
     low = min(float(np.nanmin(np.asarray(c["secant"], dtype=float))) for c in curves.values())
     axes[0, 0].set_ylim(bottom=0.1 * max(low, 1e-6))
     axes[0, 0].set_ylabel("damping: acceleration over speed [1/s]")
-    shared_legend(figure, ink=True)  # the panels' colours tell models apart, not kinds
+    shared_legend(figure, ink=True)  # a panel's colour is its model's; dashes separate the kinds of damping
     return figure
 
 
 def sensitivities(
     t: Array, relative: Mapping[str, Array], names: Sequence[str], *, output_signal: Signal
 ) -> Figure:
-    """How a free run's output moves per relative change of the prior's parameters.
+    """Relative sensitivities of a free run's output to the prior's parameters.
 
     Args:
         t: Times ``(n,)`` [s].
-        relative: By model: change of the output per 100 % of each parameter ``(n, n_p)``.
-        names: Parameters ``(n_p,)``.
+        relative: By model: change of the output per 100 % change of each parameter ``(n, n_p)``.
+        names: Names of the parameters ``(n_p,)``.
         output_signal: The output.
 
     Raises:
-        InputError: If there is nothing to draw or shapes differ.
+        InputError: If there is nothing to draw, or shapes differ.
 
     Example:
         >>> t = np.linspace(0.0, 1.0, 5)
@@ -522,11 +531,11 @@ def sensitivities(
             ax.plot(
                 t, checked(f"sensitivity of {name}", values, len(t), len(names))[:, j], **line_style(name)
             )
-        title_axes(ax, f"by {plain(parameter)}")
+        title_axes(ax, f"sensitivity to {plain(parameter)}")
     for ax in axes.ravel()[len(names) :]:
         ax.set_visible(False)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
-    figure.supylabel(f"{axis_label(output_signal)} per 100 %", fontsize=10, color=INK)
+    figure.supylabel(f"{axis_label(output_signal)} per 100 % change", fontsize=10, color=INK)
     shared_legend(figure)
     return figure

@@ -1,4 +1,4 @@
-"""A closed loop as a moving picture: the machine, its planned motion, its input, faults and alarms."""
+"""Animation of a closed loop as GIF: the machine, its planned motion, its input, faults and alarms."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ Draw = Callable[[Array], Sequence[Array]]
 
 DPI = 96
 SIZE = (8.0, 4.1)  # [inch], with one curve and one input
-PANEL = 1.1  # height of each further one [inch]
-GHOSTS = 6  # planned positions drawn at most
+PANEL = 1.1  # height of each further curve or input [inch]
+GHOSTS = 6  # maximum number of planned positions in a frame
 PLAN = colour("hybrid")
-MOST_FRAMES = 250  # of a longer loop fewer frames a second are drawn; it still plays in real time
-LAST = 1.2  # [s] for which the last frame stays before the loop starts again
+MOST_FRAMES = 250  # a longer loop gets fewer frames a second and still plays in real time
+LAST = 1.2  # duration of the last frame, before the animation starts again [s]
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class AnimatedLoop:
 
 
 class Scene:
-    """The picture: what stays is drawn once, then each frame's lines over a copy of it."""
+    """The picture of an animation: the static parts are drawn once, each frame's lines over a copy of them."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class Scene:
         self._applied: list[Line2D] = []
         for i, (ax, signal) in enumerate(zip(panels[n:], inputs, strict=True)):
             self._input_panel(ax, i, signal, None if limits is None else (limits[0][i], limits[1][i]))
-        self._bars = [  # along the top of each panel, whatever its values, for as long as the monitor alarms
+        self._bars = [  # at the top of each panel, in axes coordinates, while the monitor alarms
             self._line(
                 ax, color=ALARM, linewidth=6, solid_capstyle="butt", transform=ax.get_xaxis_transform(),
                 label="monitor alarms",
@@ -110,7 +110,7 @@ class Scene:
         shared_legend(self._figure)
 
     def _line(self, ax: Axes, **style: object) -> Line2D:
-        """A line that each frame draws anew; over those before it."""
+        """Add a line that each frame draws anew, above the lines added before."""
         (line,) = ax.plot([], [], animated=True, **style)  # type: ignore[arg-type]
         self._live.append((ax, line))
         return line
@@ -118,7 +118,7 @@ class Scene:
     def _body(
         self, ax: Axes, index: int, ink: str, alpha: float, width: float
     ) -> tuple[int, Line2D | Polygon]:
-        """The artist of one of the machine's moving lines, with that line's index."""
+        """Index and artist of one of the machine's moving lines."""
         if not _closed(self._loop.draw(self._loop.x[0])[index]):
             return index, self._line(ax, color=ink, linewidth=width, alpha=alpha, solid_capstyle="round")
         shape = Polygon([(0.0, 0.0)], color=ink, linewidth=0.0, alpha=alpha, zorder=2, animated=True)
@@ -156,7 +156,7 @@ class Scene:
             self._live.append((ax, text))
 
     def _view(self) -> tuple[Array, Array]:
-        """Corners of the machine's panel: all true positions, and the planned ones unless far beyond."""
+        """Corners of the machine's panel: all true positions, and planned positions up to 25 % beyond these."""
         loop = self._loop
         states = loop.x[:: max(1, len(loop.x) // 100)]
         true = np.concatenate([np.asarray(line) for state in states for line in loop.draw(state)])
@@ -176,7 +176,7 @@ class Scene:
         if reference is not None:
             ax.plot(loop.t, reference, color=FAINT, linewidth=1.2, label="reference")
         low, high = float(values.min()), float(values.max())
-        room = 0.4 * max(high - low, 1e-6)  # a plan that runs away does not flatten the motion
+        room = 0.4 * max(high - low, 1e-6)  # so a diverging plan does not flatten the true motion
         seen = planned[np.isfinite(planned)]
         seen = np.concatenate([seen, [low, high], [] if reference is None else reference])
         low, high = max(float(np.nanmin(seen)), low - room), min(float(np.nanmax(seen)), high + room)
@@ -201,7 +201,7 @@ class Scene:
         self._applied.append(self._line(ax, color=colour("prior"), drawstyle="steps-post", label="input"))
 
     def pictures(self, shown: Sequence[int]) -> Iterator[Image.Image]:
-        """One RGB picture for each of these samples."""
+        """Draw one RGB picture for each of these samples."""
         self._canvas.draw()
         still = self._canvas.copy_from_bbox(self._figure.bbox)
         for k in shown:
@@ -219,7 +219,7 @@ class Scene:
             past.set_data(loop.t[: k + 1], loop.x[: k + 1, column])
             dot.set_data(loop.t[k : k + 1], loop.x[k : k + 1, column])
             plan.set_data(times[ahead], loop.plans[k, ahead, column])
-        held = min(k + 1, len(loop.t) - 1)  # the input of this instant holds until the next one
+        held = min(k + 1, len(loop.t) - 1)  # the input of sample k is held until sample k + 1
         for i, line in enumerate(self._applied):
             line.set_data(
                 np.append(loop.t[: k + 1], loop.t[held]), np.append(loop.u[: k + 1, i], loop.u[k, i])
@@ -237,14 +237,16 @@ class Scene:
         even = np.linspace(0, len(later) - 1, GHOSTS + 1)[1:].astype(int)
         chosen = later[np.unique(even)] if len(later) else later
         drawn: list[Sequence[Array] | None]
-        drawn = [loop.draw(loop.plans[k, j]) for j in reversed(chosen)]  # the farthest first, the faintest
+        drawn = [
+            loop.draw(loop.plans[k, j]) for j in reversed(chosen)
+        ]  # the latest one first: it is the faintest
         hidden = GHOSTS - len(drawn)
         for lines, ghost in zip([None] * hidden + drawn, self._ghosts, strict=True):
             _place(ghost, lines)
 
 
 def _place(bodies: Sequence[tuple[int, Line2D | Polygon]], lines: Sequence[Array] | None) -> None:
-    """Move artists to a state's lines; nowhere without them."""
+    """Move artists to a state's lines, or hide them without lines."""
     for i, artist in bodies:
         points = np.full((2, 2), np.nan) if lines is None else np.asarray(lines[i])
         if isinstance(artist, Polygon):
@@ -277,27 +279,28 @@ def animate(
 ) -> Path:
     """Write a closed loop as GIF that plays in real time: the machine, its planned motion, its input.
 
-    The machine is drawn in its true state; the positions planned at that instant follow as fading ghosts, and
-    as dashed curves of states that go on from the past ones. A line that no state moves (floor, target) is
-    drawn once, in grey; closed lines are filled.
+    The machine is drawn in its true state. Its planned positions are fading outlines, and the planned states are dashed
+    curves that continue the past ones. A line that no state moves (floor, target) is drawn once, in grey. Closed lines
+    are filled.
 
     Args:
-        path: Target file, ``.gif``; its folder is made if missing. Written whole or not at all.
+        path: Target file, ``.gif``; a missing folder is created. The file is written completely or not at all.
         t: Times ``(n,)`` [s], increasing.
         x: True states ``(n, n_x)``, finite.
         plans: Predicted states ``(n, N + 1, n_x)`` at ``t_k, t_k + dt, ...``; NaN where there was no plan.
         dt: Period of the predictions [s].
-        draw: The machine's polylines ``(m, 2)`` [m] in a state ``(n_x,)``: always as many, in the same order.
+        draw: Returns the machine's polylines ``(m, 2)`` [m] in a state ``(n_x,)``: the same number of lines in the same
+            order for every state.
         u: Inputs ``(n, n_u)``, held from ``t_k`` on.
         title: The loop in one line.
-        fps: Frames a second at most; also never more than one a sample nor 250 in all.
-        curves: Which states have a curve: places in ``x``, and signals for the axes. Default: all, ``x_0, ...`` without
-            units.
+        fps: Maximum frames a second; there is at most one frame a sample and 250 frames in total.
+        curves: States with a curve: columns of ``x``, and signals for the axes. Default: all, named ``x_0, ...``,
+            without units.
         inputs: Signals of ``u``. Default: ``u_0, ...`` without units.
         limits: Lower and upper bounds of the inputs, drawn as lines where finite. Default: none.
         reference: References of the states with a curve, ``(n, len(curves))``. Default: none.
-        alarm: Whether the monitor alarms ``(n,)``. Default: nothing watches.
-        events: Instants [s] and what happens then, such as a fault. Default: none.
+        alarm: Whether the monitor alarms ``(n,)``. Default: no monitor.
+        events: Instants [s] and texts of events, such as a fault. Default: none.
 
     Raises:
         InputError: If the name does not end in ``.gif``, shapes do not fit, times do not increase, a true state
@@ -316,7 +319,7 @@ def animate(
     path = Path(path)
     if path.suffix != ".gif":
         raise InputError(
-            f"animation {path}: animations are written as GIF; end the name in .gif [HM-PLOTS-010]"
+            f"animation {path}: an animation is a GIF file; end its name with .gif [HM-PLOTS-010]"
         )
     if not dt > 0 or not fps > 0:
         raise InputError(f"animation {path}: dt and fps must be positive, got {dt} and {fps} [HM-PLOTS-011]")
@@ -325,13 +328,13 @@ def animate(
     signals = tuple(inputs) if inputs is not None else tuple(Signal(f"u_{i}", "-") for i in range(n_u))
     if len(signals) != n_u or (limits is not None and {len(bound) for bound in limits} != {n_u}):
         raise InputError(
-            f"animation {path}: needs a signal and both limits for each of the {n_u} inputs [HM-PLOTS-012]"
+            f"animation {path}: each of the {n_u} inputs needs a signal and both limits [HM-PLOTS-012]"
         )
     if curves is None:
         curves = [(i, Signal(f"x_{i}", "-")) for i in range(loop.x.shape[1])]
     if not curves or not all(0 <= column < loop.x.shape[1] for column, _ in curves):
         raise InputError(
-            f"animation {path}: curves are of states 0 to {loop.x.shape[1] - 1}, got {list(curves)} [HM-PLOTS-013]"
+            f"animation {path}: curves must be states 0 to {loop.x.shape[1] - 1}, got {list(curves)} [HM-PLOTS-013]"
         )
     target = None if reference is None else checked("reference", reference, len(loop.t), len(curves))
     if alarm is not None:
@@ -339,7 +342,7 @@ def animate(
     scene = Scene(replace(loop, events=tuple(events)), title, curves, signals, limits, target)
     shown = _frames(loop.t, fps)
     ends = np.append(loop.t[shown[1:]], loop.t[shown[-1]] + LAST)
-    # GIF knows hundredths of a second: rounded as a sum, so that the film never drifts from real time.
+    # GIF durations are hundredths of a second: the instants are rounded, not the durations, so no error accumulates.
     ticks = np.diff(np.round(100 * (ends - loop.t[0])).astype(int), prepend=0)
     _write(path, scene.pictures(shown), [10 * max(2, int(tick)) for tick in ticks])
     return path
@@ -353,13 +356,13 @@ def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw
     fits = x.ndim == u.ndim == 2 and plans.ndim == 3 and len(x) == len(u) == len(plans) == n > 0
     if not fits or plans.shape[2] != x.shape[1] or plans.shape[1] == 0:
         raise InputError(
-            f"animation {path}: needs t (n,), x (n, n_x), u (n, n_u), plans (n, N + 1, n_x) with n > 0, got "
-            f"{t.shape}, {x.shape}, {u.shape}, {plans.shape} [HM-PLOTS-014]"
+            f"animation {path}: the shapes must be t (n,), x (n, n_x), u (n, n_u), plans (n, N + 1, n_x) with n > 0,"
+            f" got {t.shape}, {x.shape}, {u.shape}, {plans.shape} [HM-PLOTS-014]"
         )
     if not np.all(np.isfinite(x)) or not np.all(np.diff(t) > 0) or not np.all(np.isfinite(t)):
         raise InputError(
-            f"animation {path}: times must increase and the true states be finite; cut the loop"
-            " [HM-PLOTS-015]"
+            f"animation {path}: times must increase and true states must be finite; cut the loop before its first"
+            " bad sample [HM-PLOTS-015]"
         )
     first = draw(x[0])
     ends = plans[:, -1][np.all(np.isfinite(plans[:, -1]), axis=1)]
@@ -373,7 +376,7 @@ def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw
 
 
 def _frames(t: Array, fps: float) -> list[int]:
-    """Samples that are drawn: the first at or after each frame's instant, and the last one."""
+    """Indices of the samples that are drawn: the first at or after each frame's instant, and the last sample."""
     length = float(t[-1] - t[0])
     rate = min(fps, (MOST_FRAMES - 1) / length) if length > 0 else fps
     instants = t[0] + np.arange(math.floor(length * rate + 1e-6) + 1) / rate
@@ -382,7 +385,7 @@ def _frames(t: Array, fps: float) -> list[int]:
 
 
 def _write(path: Path, pictures: Iterator[Image.Image], durations: Sequence[int]) -> None:
-    """One palette for all frames and no dithering, so that only what moves is stored again."""
+    """Write the GIF with one palette for all frames and no dithering: GIF then stores only the moving parts."""
     frames = list(pictures)
     few = frames[:: max(1, len(frames) // 6)]
     width, height = few[0].size

@@ -1,4 +1,4 @@
-"""Figures of the recordings: what was measured, what each part is used for, what it covers."""
+"""Figures of the recordings: signals over time, role of each part, covered states."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROLES = ("train", "valid", "test")
 
 
 class Recording(Protocol):
-    """What a figure needs of a contiguous piece of a recording (``data.Trajectory`` has it)."""
+    """Fields of a contiguous piece of a recording that a figure needs (``data.Trajectory`` has all of them)."""
 
     @property
     def name(self) -> str:
@@ -67,14 +67,14 @@ def recordings(
     disturbances: Sequence[Signal] = (),
     limit: int = 4,
 ) -> Figure:
-    """A few recordings over time, a row a file, each part shaded by what it is used for.
+    """Some recordings over time, one row for each file; the shade of a part is its role.
 
     Args:
         trajectories: Pieces of recordings; pieces of one file (same stem) share a row.
         outputs: Signals of ``y``.
         inputs: Signals of ``u``.
-        disturbances: Signals of the trajectories' ``w``, measured and not commanded. Default: none drawn.
-        limit: Most files drawn; files are chosen so that every role is seen. Default: 4.
+        disturbances: Signals of the trajectories' ``w`` (measured disturbances). Default: none drawn.
+        limit: Maximum number of files; they are chosen so that every role appears. Default: 4.
 
     Raises:
         InputError: If there is no trajectory, or its shapes do not fit the signals.
@@ -87,7 +87,7 @@ def recordings(
         >>> len(recordings([piece], [Signal("q", "m")], [Signal("F", "N")]).axes)
         2
     """
-    chosen = _chosen(trajectories, limit)
+    chosen = _choose(trajectories, limit)
     signals = (*outputs, *inputs, *disturbances)
     size = (max(10.0, 2.6 * len(signals)), 0.9 + 1.75 * len(chosen))
     figure, axes = new_figure(len(chosen), len(signals), sharey="col", size=size)
@@ -116,13 +116,13 @@ def recordings(
 def coverage(
     trajectories: Sequence[Recording], states: Sequence[Signal], pairs: Sequence[tuple[int, int]] = ()
 ) -> Figure:
-    """Where the training data have been, and where the models are tested.
+    """States that the training data and the test data cover.
 
     Args:
         trajectories: Pieces of recordings.
         states: Signals of ``x``.
-        pairs: Places in ``x`` of each position and its speed: a phase portrait each. Default: none; then every state
-            is drawn over time.
+        pairs: Columns of ``x`` of each position and its speed: one phase portrait for each pair. Default: none; every
+            state is then drawn over time.
 
     Raises:
         InputError: If there is no trajectory, or its shapes do not fit the signals.
@@ -149,7 +149,7 @@ def coverage(
         look = {"color": colour(piece.role), "label": name_of(piece.role)}
         width = 2.4 if piece.role == "train" else 1.0
         for (q, v), ax in zip(pairs, panels, strict=False):
-            position = _wrapped(x[:, q]) if states[q].periodic else x[:, q]
+            position = _wrap(x[:, q]) if states[q].periodic else x[:, q]
             ax.plot(position, x[:, v], linewidth=width, **look)
         for values, ax in zip(() if pairs else x.T, panels, strict=False):
             ax.plot(piece.t, values, linewidth=1.2, **look)
@@ -165,14 +165,15 @@ def coverage(
     return figure
 
 
-def _wrapped(angle: Array) -> Array:
-    """The angle within half a turn of zero; NaN where it passes from one side to the other, so no line is drawn."""
+def _wrap(angle: Array) -> Array:
+    """Wrap an angle to [-pi, pi); NaN where it jumps from one side to the other, so no line joins the two."""
     within = (angle + np.pi) % (2.0 * np.pi) - np.pi
     jumps = np.abs(np.diff(within, append=within[-1:])) > np.pi
     return np.where(jumps, np.nan, within)
 
 
-def _chosen(trajectories: Sequence[Recording], limit: int) -> dict[str, list[Recording]]:
+def _choose(trajectories: Sequence[Recording], limit: int) -> dict[str, list[Recording]]:
+    """Choose at most ``limit`` files, with every role among them; pieces by file stem."""
     if not trajectories:
         raise InputError("plot of the recordings: there is no recording to draw [HM-PLOTS-018]")
     files: dict[str, list[Recording]] = {}

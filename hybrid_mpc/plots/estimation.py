@@ -1,4 +1,4 @@
-"""Figures of the estimators: the consistency of their innovations."""
+"""Figures of the observers: the consistency of their innovations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hybrid_mpc.plots.style import (
 )
 
 WINDOW = 50
-"""Samples of a running mean."""
+"""Samples of the running mean."""
 
 
 def innovations(
@@ -41,15 +41,17 @@ def innovations(
 ) -> Figure:
     """NIS over time with the 95 % bands of a consistent filter, and the autocorrelation of the innovations.
 
+    The NIS (normalised innovation squared) of a consistent filter is chi-squared with ``n_y`` degrees of freedom
+    (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4).
+
     Args:
-        nis: Normalised innovations squared of each recording ``(n,)`` [-], joined in the figure; NaN where nothing was
-            measured.
-        autocorrelation: Of the normalised innovations at lags 1, 2, ..., ``(lags, n_y)``.
-        dt: Period [s].
+        nis: NIS of each recording ``(n,)`` [-], joined in the figure; NaN for a sample without measurement.
+        autocorrelation: Autocorrelation of the normalised innovations at lags 1, 2, ..., ``(lags, n_y)``.
+        dt: Sampling period [s].
         outputs: Signals of the outputs.
-        mean_band: Band of the mean NIS over all samples.
+        mean_band: Lower and upper end of the band of the mean NIS over all samples.
         correlation_band: Half width of the band of one autocorrelation.
-        title: Default: none.
+        title: Title. Default: none.
 
     Raises:
         InputError: If there are no recordings, or shapes do not fit.
@@ -64,7 +66,7 @@ def innovations(
 
     if not nis or not dt > 0:
         raise InputError(
-            "plot of the innovations: needs at least one recording and a positive period [HM-PLOTS-019]"
+            "plot of the innovations: at least one recording and a positive period are needed [HM-PLOTS-019]"
         )
     lags, n_y = len(autocorrelation), len(outputs)
     r = checked("autocorrelation", autocorrelation, lags, n_y)
@@ -77,9 +79,13 @@ def innovations(
     top.plot(t[: len(mean)] + 0.5 * WINDOW * dt, mean, color=COLOURS["hybrid"], linewidth=1.3,
              label=f"mean over {WINDOW} samples")  # fmt: skip
     low, high = (float(chi2.ppf(p, WINDOW * n_y)) / WINDOW for p in (0.025, 0.975))
-    top.axhspan(low, high, color=GOOD, alpha=0.15, linewidth=0, label=f"95 % band of a mean over {WINDOW}")
+    top.axhspan(low, high, color=GOOD, alpha=0.15, linewidth=0, label=f"95 % band of the mean over {WINDOW}")
     top.axhline(
-        float(chi2.ppf(0.95, n_y)), color=INK, linestyle=":", linewidth=1.1, label="95 % of single NIS"
+        float(chi2.ppf(0.95, n_y)),
+        color=INK,
+        linestyle=":",
+        linewidth=1.1,
+        label="95 % limit of a single NIS",
     )
     for edge in np.cumsum([len(v) for v in nis])[:-1]:
         top.axvline(dt * edge, color=FAINT, linewidth=0.6)
@@ -87,11 +93,11 @@ def innovations(
     finite = values[np.isfinite(values)]
     top.set_ylim(1e-2 * n_y, max(20.0 * n_y, 1.2 * float(finite.max(initial=1.0))))
     top.set_ylabel("NIS [-]")
-    top.set_xlabel("time, recordings one after the other [s]")
+    top.set_xlabel("time, recordings joined [s]")
     top.margins(x=0)
     whole = float(finite.mean()) if len(finite) else float("nan")
     title_axes(
-        top, f"mean {number(whole)}, a consistent filter's: {number(mean_band[0])} to {number(mean_band[1])}"
+        top, f"mean {number(whole)}; consistent filter: {number(mean_band[0])} to {number(mean_band[1])}"
     )
     width = 0.7 / n_y
     for i, signal in enumerate(outputs):
@@ -102,11 +108,11 @@ def innovations(
     bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
     bottom.set_xlabel("lag [samples]")
     bottom.set_ylabel("autocorrelation of the\nnormalised innovations [-]")
-    title_axes(bottom, "band: 95 % of white innovations, each lag by itself")
+    title_axes(bottom, "band: 95 % interval of white innovations, for each lag alone")
     shared_legend(figure)
     return figure
 
 
 def _windows(values: Array) -> Array:
-    """All windows ``(n - w + 1, w)``; the whole where it is shorter than one."""
+    """All windows ``(n - w + 1, w)`` of ``w`` samples; a series shorter than a window is one window."""
     return np.lib.stride_tricks.sliding_window_view(values, min(WINDOW, len(values)))

@@ -1,4 +1,4 @@
-"""Figures of a search for missing terms: what each step removed of the error, and each term over its data."""
+"""Figures of a search for missing terms: error after each step, and each term over its data."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.plots.style import FAINT, GOOD, INK, colour, new_figure, number, plain, shared_legend
 
 WORDS = 38
-"""Characters of a label at most before it is broken."""
+"""Maximum characters of a line of a label."""
 WAVES = 6.0
-"""Ways up and down of a term along its abscissa up to which it is drawn as a line; beyond, another signal acts too."""
+"""A term is drawn as a line while its total variation is at most this many times its range. A term beyond that also
+depends on another signal, and is drawn as points."""
 
 
 class Picture(Protocol):
@@ -23,43 +24,43 @@ class Picture(Protocol):
 
     @property
     def abscissa(self) -> str:
-        """Label of what it is drawn over."""
+        """Label of the horizontal axis."""
 
     @property
     def ordinate(self) -> str:
-        """Label of what it adds."""
+        """Label of the vertical axis."""
 
     @property
     def at(self) -> Sequence[float]:
-        """Where the recordings were, increasing."""
+        """Points on the horizontal axis that the recordings cover, increasing."""
 
     @property
     def term(self) -> Sequence[float]:
-        """What it adds there."""
+        """Value of the term at each point."""
 
     @property
     def low(self) -> Sequence[float]:
-        """That less two standard errors."""
+        """Value of the term minus two standard errors."""
 
     @property
     def high(self) -> Sequence[float]:
-        """That and two standard errors."""
+        """Value of the term plus two standard errors."""
 
     @property
     def data(self) -> Sequence[float]:
-        """What the recordings ask for there; empty where nothing shows it."""
+        """Value of the missing term according to the recordings; empty where they do not show it."""
 
 
 def error_steps(
     labels: Sequence[str], errors: Sequence[float], what: str, floor: float | None = None
 ) -> Figure:
-    """A bar a model, from the nominal prior on: how much of the error each step removed.
+    """Error of each model as a bar, from the nominal prior on, with the part that each step removed.
 
     Args:
-        labels: Of the bars: ``"nominal"``, ``"fitted"``, then what was added or removed.
-        errors: Errors, not negative; what is not finite has no bar.
-        what: What the errors are, with unit.
-        floor: Error that the sensors' noise alone makes. Default: it is not drawn.
+        labels: Labels of the bars: ``"nominal"``, ``"fitted"``, then the terms that were added or removed.
+        errors: Errors, not negative; an error that is not finite has no bar.
+        what: Name and unit of the errors.
+        floor: Error due to the sensors' noise alone. Default: not drawn.
 
     Raises:
         InputError: If no error is finite.
@@ -80,7 +81,7 @@ def error_steps(
             continue
         ink = colour("phy_nominal") if k == 0 else colour("phy") if k == 1 else GOOD
         ax.barh(k, value, color=ink, height=0.62)
-        if math.isfinite(before) and before > value:  # what the step removed
+        if math.isfinite(before) and before > value:  # the part of the error that the step removed
             ax.barh(k, before - value, left=value, color=ink, alpha=0.18, height=0.62)
         share = (
             f" ({100 * value / before:.0f} % of the bar above)"
@@ -89,7 +90,7 @@ def error_steps(
         )
         ax.text(max(value, before if math.isfinite(before) else 0.0) + 0.01 * top, k, f"{number(value)}{share}",
                 va="center", fontsize=9, color=INK)  # fmt: skip
-    ax.set_yticks(range(len(labels)), [_broken(plain(label)) for label in labels])
+    ax.set_yticks(range(len(labels)), [_break_lines(plain(label)) for label in labels])
     ax.invert_yaxis()
     ax.set_xlim(0.0, 1.32 * top)
     ax.set_xlabel(plain(what))
@@ -101,7 +102,7 @@ def error_steps(
 
 
 def term_over_data(picture: Picture) -> Figure:
-    """A term over its data: the fitted law with two standard errors, and what the recordings ask for.
+    """A term over its data: the fitted law with two standard errors, and its values according to the recordings.
 
     Args:
         picture: The term over its data.
@@ -114,7 +115,7 @@ def term_over_data(picture: Picture) -> Figure:
     low, high, term = (np.array(v) for v in (picture.low, picture.high, picture.term))
     if len(picture.data):
         data = np.array(picture.data)
-        ax.plot(at, data, ".", color=FAINT, markersize=4, alpha=0.7, label="what the recordings ask for")
+        ax.plot(at, data, ".", color=FAINT, markersize=4, alpha=0.7, label="according to the recordings")
         reach = np.concatenate([low, high, np.quantile(data, [0.02, 0.98])])
         margin = 0.15 * (reach.max() - reach.min()) or 1.0
         ax.set_ylim(reach.min() - margin, reach.max() + margin)
@@ -124,13 +125,13 @@ def term_over_data(picture: Picture) -> Figure:
         at, term, "-" if line else ".", color=colour("phy"), linewidth=1.8, markersize=5, label="the term"
     )
     ax.set_xlabel(plain(picture.abscissa))
-    ax.set_ylabel(_broken(plain(picture.ordinate)))
+    ax.set_ylabel(_break_lines(plain(picture.ordinate)))
     shared_legend(figure)
     return figure
 
 
-def _broken(text: str) -> str:
-    """A label in two lines where it is long."""
+def _break_lines(text: str) -> str:
+    """Break a long label into lines of at most ``WORDS`` characters."""
     if len(text) <= WORDS:
         return text
     words, lines = text.split(), [""]

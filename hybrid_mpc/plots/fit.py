@@ -36,14 +36,14 @@ from hybrid_mpc.plots.style import (
 )
 
 ABREAST = 4
-"""Most panels of the errors side by side."""
+"""Maximum number of error panels side by side."""
 COURSE = 200
-"""Points of the course of the errors over the whole run."""
+"""Points of the RMS error over the whole run."""
 
 
 @dataclass(frozen=True)
 class BalanceRun:
-    """A balance along a free run: its name, the unit of its rate, and its residuals ``(n,)``, measured and model's."""
+    """A balance along a free run: name, unit of its rate, and residuals ``(n,)`` of measurement and model."""
 
     name: str
     unit: str
@@ -68,8 +68,8 @@ def free_run(
 
     Args:
         t: Times ``(n,)`` [s].
-        measured: Measured (smoothed) states, and outputs that are none of them ``(n, n_s)``; NaN where not measured.
-        predictions: The same of each model's free run; NaN during the warm-up.
+        measured: Measured (smoothed) states, then outputs that are not states, ``(n, n_s)``; NaN where not measured.
+        predictions: The same signals of each model's free run; NaN during the warm-up.
         u: Inputs ``(n, n_u)``, held between samples.
         signals: Signals of ``measured``.
         inputs: Signals of ``u``.
@@ -106,7 +106,7 @@ def free_run(
             if model in runs:
                 under.plot(t, runs[model][:, i] - states[:, i], **(line_style(model) | {"linewidth": 1.0}))
         low, high = np.nanmin(states[:, i]), np.nanmax(states[:, i])
-        room = 0.6 * max(high - low, 1e-9)  # a model that runs away must not flatten the others
+        room = 0.6 * max(high - low, 1e-9)  # so a diverging model does not flatten the others
         bottom, top = ax.get_ylim()
         limits = max(bottom, low - room), min(top, high + room)
         if band and signal.name in band:
@@ -134,12 +134,12 @@ def free_run(
 def input_correlations(
     lags: Array, found: Mapping[str, Mapping[tuple[str, str], tuple[Array, float]]], *, title: str = ""
 ) -> Figure:
-    """Correlation of free runs' errors with each input of before, a panel for each pair of input and output.
+    """Correlation of free-run errors with each earlier input, one panel for each pair of input and output.
 
     Args:
-        lags: Lags ``(m,)`` [s].
-        found: By model and ``(input, output)``: correlations ``(m,)`` and half the width of the band of
-            independent ones.
+        lags: Lags ``(m,)`` [s] of the error behind the input.
+        found: By model and ``(input, output)``: correlations ``(m,)``, and half the width of the band of independent
+            signals.
         title: Title. Default: none.
 
     Example:
@@ -159,7 +159,7 @@ def input_correlations(
         ax.set_ylabel(f"{plain(pair[1])} error\nwith {plain(pair[0])} [-]")
         ax.set_ylim(-1.0, 1.0)
     finish_column(figure, panels)
-    panels[-1].set_xlabel("input before by [s]")
+    panels[-1].set_xlabel("lag of the error behind the input [s]")
     return figure
 
 
@@ -169,15 +169,15 @@ def errors_bar(
     *,
     spread: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Figure:
-    """Errors of the models, one panel a metric, with the fitted prior as the line to beat.
+    """Errors of the models, one panel for each metric, with a line at the error of the fitted prior.
 
     Args:
         errors: ``{model: {metric: value}}``; a missing value or None leaves a gap.
         metrics: Axis label with unit by metric name.
-        spread: Standard deviation over the trained networks in the same form. Default: none drawn.
+        spread: Standard deviation over the trained networks, in the same form. Default: not drawn.
 
     Returns:
-        The figure. A bar far above all others is cut and marked; its number stays.
+        The figure. A bar over three times as high as the next one is cut and marked; its number stays.
 
     Raises:
         InputError: If no model has any of the metrics.
@@ -193,7 +193,7 @@ def errors_bar(
     columns = min(len(shown), ABREAST)
     rows = math.ceil(len(shown) / columns)
     figure, axes = new_figure(rows, columns, size=(max(5.0, 3.4 * columns), 0.6 + 3.6 * rows))
-    line = f"{name_of('phy')}: the line to beat"
+    line = f"error of the {name_of('phy')}"
     panels: list[Axes] = axes.ravel().tolist()
     for ax in panels[len(shown) :]:
         ax.set_visible(False)
@@ -237,14 +237,14 @@ def _bars(ax: Axes, values: Mapping[str, float], spread: Mapping[str, float]) ->
 
 
 def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figure:
-    """Differences between the trained and the exported model, as shares of all compared numbers.
+    """Distribution of the differences between the trained and the exported model.
 
     Args:
-        errors: Absolute differences by what is compared, e.g. ``{"values": (m,), "Jacobians": (k,)}``.
+        errors: Absolute differences by quantity, e.g. ``{"values": (m,), "Jacobians": (k,)}``.
         tolerances: Allowed difference by the same names; drawn as vertical lines.
 
     Returns:
-        The figure. Exact agreement (0) is drawn at 1e-18, left of every float64 rounding error.
+        The figure. A difference of zero is drawn at 1e-18, below every float64 rounding error.
 
     Raises:
         InputError: If there is nothing to draw.
@@ -268,7 +268,7 @@ def parity(errors: Mapping[str, Array], tolerances: Mapping[str, float]) -> Figu
     ax.set_ylim(0, 103)
     ax.set_xlabel("absolute difference, trained against exported [SI]")
     ax.set_ylabel("share of numbers below [%]")
-    title_axes(ax, "left of its dashed line: passed")
+    title_axes(ax, "passed: the curve lies left of its dashed line")
     ax.title.set_color(MUTED)
     shared_legend(figure)
     return figure
@@ -287,7 +287,7 @@ def benchmark_run(
     title: str = "",
     names: Mapping[str, str] | None = None,
 ) -> Figure:
-    """A free run over a recording: outputs, errors, inputs, and the errors' course over the whole run.
+    """A free run over a recording: outputs, errors and inputs at its start, and the RMS error over the whole run.
 
     Args:
         t: Times ``(n,)`` [s].
@@ -296,11 +296,11 @@ def benchmark_run(
         u: Inputs ``(n, n_u)``, held between samples.
         outputs: Signals of ``y``.
         inputs: Signals of ``u``.
-        units: Unit of each output's error, and how many of it are one of the output's. Default: the output's own.
-        shown: Length [s] of the run's start that is drawn sample by sample; the rest is in the errors' course.
-            Default: all of it.
+        units: Unit of each output's error, and the number of these units in one unit of the output. Default: the unit
+            of the output, and 1.
+        shown: Length [s] of the start that is drawn sample by sample. Default: the whole run.
         title: Title. Default: none.
-        names: How models are called in the legend, where not as everywhere.
+        names: Names of models in the legend. Default: the common names.
 
     Raises:
         InputError: If shapes do not fit.
@@ -326,7 +326,9 @@ def benchmark_run(
     plot_inputs(between, t[near], u[near], inputs)
     for ax, values in zip(between, u[near].T, strict=True):
         size = max(float(np.abs(values).max()), 1e-9)
-        if np.ptp(values) < 1e-6 * size:  # a constant input is drawn as one, not its rounding
+        if (
+            np.ptp(values) < 1e-6 * size
+        ):  # a constant input is a flat line; do not zoom into its rounding errors
             ax.set_ylim(float(values.mean()) - size, float(values.mean()) + size)
     for ax in column:
         ax.margins(x=0)
@@ -347,7 +349,7 @@ def _output(
     scale: float,
     names: Mapping[str, str],
 ) -> None:
-    """One output of a benchmark's run: itself and its errors at first, and the course of the errors."""
+    """Draw one output of a benchmark's run: signal and error at the start, and the RMS error over the whole run."""
     signal, error = above
     signal.plot(t[near], y[near], **(line_style("measured") | {"linewidth": 2.2, "alpha": 0.85}))
     for name, run in runs.items():
@@ -359,7 +361,7 @@ def _output(
         below.plot(at, course, **(style | {"linewidth": 1.4}))
     low, high = np.nanmin(y[near]), np.nanmax(y[near])
     room = 0.3 * max(float(high - low), 1e-9)
-    signal.set_ylim(low - room, high + room)  # a model that runs away flattens no other
+    signal.set_ylim(low - room, high + room)  # so a diverging model does not flatten the others
     with np.errstate(over="ignore", invalid="ignore"):
         worst = [float(np.abs(scale * (run - y))[near & np.isfinite(y)].max()) for run in runs.values()]
     best = min((value for value in worst if np.isfinite(value)), default=0.0)
@@ -369,7 +371,7 @@ def _output(
 
 
 def _course(t: Array, error: Array) -> tuple[Array, Array]:
-    """Root mean square of the error over short parts of the run, at their middles."""
+    """Mean times and root mean square of the error of up to ``COURSE`` equal parts of the run."""
     parts = np.array_split(np.arange(len(t)), min(COURSE, max(1, len(t) // 5)))
     with np.errstate(over="ignore", invalid="ignore"):
         rms = np.array([np.sqrt(np.nanmean(error[part] ** 2)) for part in parts])
@@ -385,15 +387,16 @@ def prediction(
     model: str,
     title: str = "",
 ) -> Figure:
-    """Predictions of a recording: every output with its bands, and under it the residuals.
+    """Predictions of a recording: every output with its prediction and band, and below it the residuals.
 
     Args:
         t: Times ``(n,)`` [s].
         measured: Measured outputs ``(n, n_y)``; NaN where a sample is missing.
-        runs: Predictions and half widths of their band, ``(n, n_y)`` each, by name; the first in the model's colour.
+        runs: By name: prediction and half width of its band, ``(n, n_y)`` each. The first has the model's colour, and
+            only its band is drawn.
         outputs: Signals of the outputs.
         model: Name of the model.
-        title: Over all panels. Default: none.
+        title: Title over all panels. Default: none.
 
     Example:
         >>> t = np.linspace(0.0, 1.0, 5)
@@ -415,7 +418,9 @@ def prediction(
                 ax.plot(t, centre, color=shade, linewidth=1.2 if k == 0 else 0.9, label=name, zorder=3 - k)
             ends = (top, values - width, values + width), (bottom, -width, width)
             for ax, low, high in ends if k == 0 else ():
-                ax.fill_between(t, low, high, color=shade, alpha=0.18, linewidth=0, label="its band")
+                ax.fill_between(
+                    t, low, high, color=shade, alpha=0.18, linewidth=0, label=f"band of the {name}"
+                )
         bottom.axhline(0.0, color=FAINT, linewidth=0.8)
         top.set_ylabel(axis_label(signal))
         bottom.set_ylabel(f"residual\n[{plain(signal.unit)}]")
@@ -429,13 +434,13 @@ def curves(
     free_run_start: Mapping[str, float] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Training curves, a column a model: each objective with its never-rising bound, and the validation.
+    """Training curves, one column for each model: each objective with its bound (never rising), and the validation.
 
     Args:
-        training: By model, arrays of equal length: ``step``, ``loss_`` and the name of an objective and, where the
-            model has them, ``bound_`` and that name, and ``validation``. NaN where a value was not taken at a step.
-        free_run_start: Step at which a model's training turns from teacher forcing to free runs.
-        units: Units by objective, and that of the ``"validation"``. Default: none has one.
+        training: By model, arrays of equal length: ``step``, ``loss_NAME`` of each objective, and optionally
+            ``bound_NAME`` and ``validation``. NaN at a step without a value.
+        free_run_start: By model: step at which the training switches from teacher forcing to free runs.
+        units: Units by objective, and that of ``"validation"``. Default: no units.
 
     Raises:
         InputError: If there is no model, ``step`` is missing, or lengths differ.

@@ -1,4 +1,4 @@
-"""A drawn figure of curves over time as one that can be zoomed, read and switched in a browser."""
+"""Interactive form of a figure over time: zoom, read values and switch signals in a browser."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from hybrid_mpc.files import write_text
 
 Array = NDArray[np.float64]
 PIXELS = 92.0
-"""Pixels an inch of a figure."""
+"""Pixels for each inch of the drawn figure."""
 AROUND, LINE = 60, 24
-"""Pixels around a panel's axes, and of a line of its title and legend."""
+"""Pixels of a panel's frame, and of a line of its title or legend."""
 COLUMNS = 4
 """Signals in a line of a legend."""
 MOST = 4000
-"""Points of a curve; a longer one is thinned to the lowest and the highest of each stretch."""
+"""Maximum points of a curve; a longer curve is thinned to the minimum and maximum of each stretch."""
 DASHES = {"-": "solid", "--": "dashed", ":": "dotted", "-.": "dashdot"}
 SCALES = {"log": "log"}
-"""Axes that are not linear in a browser either."""
+"""Scale of an axis in Bokeh by that in matplotlib; all others are linear."""
 STEPS = {"steps-post": "after", "steps-pre": "before", "steps": "before", "steps-mid": "center"}
 
 
 def over_time(figure: Figure) -> bool:
-    """Whether all of a figure's panels lie over time.
+    """Whether the horizontal axis of all of a figure's panels is the time.
 
     Example:
         >>> from hybrid_mpc.plots.style import new_figure
@@ -49,17 +49,18 @@ def over_time(figure: Figure) -> bool:
 
 
 def write_interactive(figure: Figure, picture: Path) -> Path:
-    """Write a figure's interactive form beside its picture, ``NAME.json`` for ``NAME.png``; the path.
+    """Write the interactive form of a figure beside its picture, ``NAME.json`` for ``NAME.png``; return its path.
 
-    It holds curves, bands, marked stretches and lines, with the figure's colours, units and legends; what is written
-    into a picture is left out. Panels that share their time zoom together, and a signal is switched in all panels.
+    The file holds curves, bands, marked stretches and lines, with the figure's colours, units and legends. Texts inside
+    the axes are left out. Panels with a shared time axis zoom together. A legend entry switches its signal in all
+    panels.
 
     Args:
-        figure: The drawn figure; it stays as it is.
+        figure: The drawn figure; it is not changed.
         picture: Path of its picture.
 
     Raises:
-        StorageError: If it cannot be written.
+        StorageError: If the file cannot be written.
 
     Example:
         >>> import tempfile
@@ -91,13 +92,13 @@ def write_interactive(figure: Figure, picture: Path) -> Path:
 
 @dataclass
 class _Panels:
-    """Panels of a figure, and what they share.
+    """Panels of a figure, and the objects that they share.
 
     Args:
         drawn: The figure.
-        ranges: Axes that are there, with the range of their panel's horizontal axis.
-        abscissas: Instants, each kept once.
-        signals: The first curve of each label, which switches the others.
+        ranges: Axes converted so far, with the horizontal range of their panel.
+        abscissas: Time arrays by their bytes, so that each is stored once.
+        signals: The first curve of each label, which switches the other curves of that label.
     """
 
     drawn: Figure
@@ -106,7 +107,7 @@ class _Panels:
     signals: dict[str, Any] = field(default_factory=dict)
 
     def add(self, ax: Axes) -> Any:
-        """The panel of some axes."""
+        """Convert axes to a panel."""
         from bokeh.models import HoverTool
         from bokeh.plotting import figure
 
@@ -116,7 +117,7 @@ class _Panels:
         panel = figure(
             title=plain(title) or None, x_axis_label=plain(ax.get_xlabel()), y_axis_label=plain(ax.get_ylabel()),
             x_axis_type=SCALES.get(ax.get_xscale(), "linear"), y_axis_type=SCALES.get(ax.get_yscale(), "linear"),
-            tools="xpan,xwheel_zoom,box_zoom,reset,save", active_drag="box_zoom", active_scroll=None,
+            tools="xpan,xwheel_zoom,xbox_zoom,reset,save", active_drag="xbox_zoom", active_scroll=None,
             x_range=shared[0] if shared else ax.get_xlim(), height=round(PIXELS * height) + AROUND,
         )  # fmt: skip
         self.ranges.append((ax, panel.x_range))
@@ -125,8 +126,8 @@ class _Panels:
         named = ax.get_legend() is not None or (bool(self.drawn.legends) and ax is self.drawn.axes[0])
         curves = [self._curve(panel, line, named) for line in ax.lines if not _straight(panel, ax, line)]
         curves = [curve for curve in curves if curve is not None]
-        told = "<b>$name</b>: $snap_y{0.[0000]} at $snap_x{0.[000]}"
-        panel.add_tools(HoverTool(renderers=curves, mode="vline", line_policy="nearest", tooltips=told))
+        tooltip = "<b>$name</b>: $snap_y{0.[0000]} at $snap_x{0.[000]}"
+        panel.add_tools(HoverTool(renderers=curves, mode="vline", line_policy="nearest", tooltips=tooltip))
         panel.height += LINE * bool(title)
         for legend in list(panel.legend):
             panel.height += LINE * (1 + len(legend.items) // COLUMNS)
@@ -137,7 +138,7 @@ class _Panels:
         return panel
 
     def _curve(self, panel: Any, line: Line2D, named: bool) -> Any:
-        """A curve or points; None for one without any."""
+        """Add a curve or points to a panel; None for a curve without finite values."""
         from bokeh.models import ColumnDataSource, CustomJS
 
         x, y = (np.asarray(v, dtype=np.float64) for v in line.get_data(orig=False))
@@ -148,7 +149,7 @@ class _Panels:
         source = ColumnDataSource({"x": x, "y": y.astype(np.float32)})
         label = plain(str(line.get_label()))
         label = "" if label.startswith("_") else label
-        # a tooltip is HTML, which the browser's library fills in as it is
+        # Bokeh inserts the name into the tooltip's HTML without escaping it
         ink = {
             "color": to_hex(line.get_color()),
             "alpha": line.get_alpha() or 1.0,
@@ -176,7 +177,7 @@ class _Panels:
 
 
 def _straight(panel: Any, ax: Axes, line: Line2D) -> bool:
-    """Whether it is a line across the whole panel, which is then drawn."""
+    """Add a line across the whole panel (axhline, axvline) and return True; False for any other line."""
     from bokeh.models import Span
 
     across = line.get_transform().contains_branch_seperately(ax.transData)
@@ -192,7 +193,7 @@ def _straight(panel: Any, ax: Axes, line: Line2D) -> bool:
 
 
 def _shade(panel: Any, ax: Axes, artist: Artist) -> None:
-    """A marked stretch of time, or the area of a band; nothing else."""
+    """Add a marked stretch of time or the area of a band to a panel; ignore all other artists."""
     from bokeh.models import BoxAnnotation
 
     if isinstance(artist, Rectangle):
@@ -211,7 +212,7 @@ def _shade(panel: Any, ax: Axes, artist: Artist) -> None:
 
 
 def thinned(x: Array, y: Array, most: int = MOST) -> tuple[Array, Array]:
-    """A curve ``(n,)`` of at most ``most`` points: the lowest and the highest of each stretch stay.
+    """Thin a curve ``(n,)`` to at most ``most`` points: the minimum and maximum of each stretch stay.
 
     Example:
         >>> x = np.arange(10000.0)
@@ -230,7 +231,7 @@ def thinned(x: Array, y: Array, most: int = MOST) -> tuple[Array, Array]:
 
 
 def plain(text: str) -> str:
-    r"""A label without mathematical typesetting, in one line.
+    r"""Convert a label to one line without mathematical typesetting.
 
     Example:
         >>> plain(r"simulation error $E_{sim}$ [-]"), plain(r"$\dot\varphi$ [rad/s]")

@@ -1,4 +1,4 @@
-"""Figures of the closed loops: tracking, the time of a step, and what each controller costs beside the oracle."""
+"""Figures of the closed loops: tracking, duration of a step, cost of each controller relative to the oracle."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ from hybrid_mpc.plots.style import (
 Limits: TypeAlias = tuple[Sequence[float] | Array, Sequence[float] | Array]
 """Lower and upper bounds, one a signal."""
 FITS = 16
-"""Characters of a label that are no longer than a panel of an error is high; a longer one gets a line for its unit."""
+"""Maximum characters of a label beside an error panel; a longer label has its unit in a second line."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One closed loop as a figure needs it.
+    """Signals of one closed loop for a figure.
 
     Args:
         t: Times ``(n,)`` [s].
         x: True states ``(n, n_x)``.
         u: Inputs ``(n, n_u)``, held between samples.
-        y: Measured outputs ``(n, n_y)``; NaN for a dropout. Default: those that are no states are not drawn.
+        y: Measured outputs ``(n, n_y)``; NaN for a dropout. Default: outputs that are not states are not drawn.
     """
 
     t: Array
@@ -59,7 +59,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class _Panel:
-    """A signal of the loops: where its values are, its reference ``(m,)`` if it has one, its bounds."""
+    """A signal of the loops: field and column of its values, its reference ``(m,)`` or None, its bounds."""
 
     signal: Signal
     of: Literal["x", "y"]
@@ -86,26 +86,26 @@ def closed_loops(
 ) -> Figure:
     """The same task under each controller: outputs and states with references and bounds, tracking errors, inputs.
 
-    Every output and every state has a panel, and each that has a reference one of its error. An output that is a state
-    is drawn once, in its true value; another one as it was measured.
+    Every output and every state has a panel. Every signal with a reference has a panel of its tracking error. An output
+    that is also a state is drawn once, with its true value; other outputs are drawn as measured.
 
     Args:
         title: The task in one line.
         t: Times ``(m,)`` [s] of the references.
-        reference: Reference states ``(m, n_x)``; None where references are the outputs'.
+        reference: Reference states ``(m, n_x)``; None where only outputs have references.
         results: Closed loop by controller (``"prior"``, ``"hybrid"``, ``"oracle"``).
         states: Signals of ``x``.
         inputs: Signals of ``u``.
         limits: Lower and upper bounds of the inputs, drawn where finite. Default: none drawn.
-        outputs: Signals of ``y``. Default: those that are no states are not drawn.
-        output_reference: Reference outputs ``(m, n_y)``, NaN for one that is not controlled. Default: none.
+        outputs: Signals of ``y``. Default: outputs that are not states are not drawn.
+        output_reference: Reference outputs ``(m, n_y)``; NaN for an output that is not controlled. Default: none.
         state_limits: Bounds of the states. Default: none drawn.
         output_limits: Bounds of the outputs. Default: none drawn.
         disturbances: Signals of ``w``. Default: none.
         w: Measured disturbances ``(m, n_w)`` that acted. Default: none drawn.
 
     Raises:
-        InputError: If there is no loop or shapes do not fit.
+        InputError: If there is no loop, or shapes do not fit.
 
     Example:
         >>> t, x, u = np.array([0.0, 0.1]), np.zeros((2, 2)), np.zeros((2, 1))
@@ -171,7 +171,7 @@ def _panels(
     y_limits: Limits | None,
     measured: bool,
 ) -> list[_Panel]:
-    """Outputs in their order, then the states that are none of them."""
+    """Panels of the outputs in their order, then of the states that are not outputs."""
 
     def bounds(limits: Limits | None, i: int) -> tuple[float, ...]:
         return () if limits is None or not len(limits[0]) else (float(limits[0][i]), float(limits[1][i]))
@@ -200,11 +200,11 @@ def _bounds(ax: Axes, bounds: Sequence[float], label: str) -> None:
 
 
 def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
-    """How long a controller step takes, against the period that it must fit into: distribution, share of longer steps.
+    """Duration of a controller step and the control period: distribution, and share of longer steps.
 
     Args:
         times_ms: Durations of all steps by controller, ``(n,)`` [ms].
-        period_ms: Control period [ms], the deadline.
+        period_ms: Control period [ms], which is the deadline.
 
     Raises:
         InputError: If a controller has no positive durations, or the period is not positive.
@@ -215,13 +215,13 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
     """
     if not times_ms or not period_ms > 0:
         raise InputError(
-            "plot of the solve times: needs at least one controller and a positive period [HM-PLOTS-026]"
+            "plot of the solve times: at least one controller and a positive period are needed [HM-PLOTS-026]"
         )
     data = {name: np.sort(np.ravel(np.asarray(v, dtype=float))) for name, v in times_ms.items()}
     for name, values in data.items():
         if len(values) == 0 or not values[0] > 0:
             raise InputError(
-                f"plot of the solve times of {name}: needs positive durations [ms] [HM-PLOTS-027]"
+                f"plot of the solve times of {name}: all durations [ms] must be positive [HM-PLOTS-027]"
             )
     figure, axes = new_figure(1, 2, size=(10, 4.0))
     left, right = axes[0]
@@ -252,7 +252,7 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
     return figure
 
 
-# Name, role whose colour it takes, marker, filled. With a disturbance observer: the same colour, hollow.
+# Name, role that sets the colour, marker, filled. A controller with a disturbance observer has a hollow marker.
 CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = {
     "prior": (name_of("prior"), "prior", "o", True),
     "prior_observer": (name_of("prior_observer"), "prior", "s", False),
@@ -266,27 +266,26 @@ Costs = Mapping[str, Mapping[str, tuple[float, float]]]
 
 
 def costs(table: Costs) -> Figure:
-    """Closed-loop cost of every controller in every task, relative to the oracle that measures.
+    """Closed-loop cost of every controller in every task, relative to the measuring oracle.
 
-    The table holds by task and controller the mean cost and the half width of its 95 % interval. The interval is the
-    controller's own, divided by the oracle's mean; the oracle's own interval shows how well that is known. A missing
-    controller or a mean that is not finite leaves a gap; an interval that is not finite (a single seed) is not drawn. A
-    task without the oracle's cost keeps its row, with a note. The axis is logarithmic where the costs span more than a
-    factor of 5.
+    The table holds, by task and controller, the mean cost and the half width of its 95 % interval. Both are divided by
+    the oracle's mean cost; the oracle's own interval shows the uncertainty of that mean. A missing controller or a mean
+    that is not finite leaves a gap. An interval that is not finite (a single seed) is not drawn. A task without the
+    oracle's cost keeps its row, with a note. The axis is logarithmic where costs span more than a factor of 5.
     """
     relative = {task: _relative(row) for task, row in table.items()}
     points = [mean for row in relative.values() for mean, _ in row.values()]
     if not points:
         raise InputError(
-            f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of 'oracle' to compare with"
-            " [HM-PLOTS-028]"
+            f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of the controller 'oracle', to"
+            " which costs are relative [HM-PLOTS-028]"
         )
     present = _ordered({name for row in relative.values() for name in row})
     height = 0.25 + 0.11 * len(present)
     figure, axes = new_figure(1, 1, size=(9, 1.5 + height * len(table)))
     ax = axes[0, 0]
     log = max(points) > 5 * min(points) > 0
-    lowest = 0.8 * min(points)  # on a logarithmic axis an interval that reaches zero is cut here
+    lowest = 0.8 * min(points)  # lower end of an interval that reaches zero, on a logarithmic axis
     ax.axvline(1.0, color=FAINT, linewidth=1.0, zorder=1)
     for k, row in enumerate(relative.values()):
         if k:
@@ -312,7 +311,7 @@ def costs(table: Costs) -> Figure:
 
 
 def _relative(row: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """Finite means over the oracle's, with half widths (0 where unknown); empty without an oracle."""
+    """Finite means and half widths (0 where unknown), divided by the oracle's mean; empty without an oracle."""
     scale = float(row.get("oracle", (math.nan, math.nan))[0])
     if not (math.isfinite(scale) and scale > 0):
         return {}
@@ -324,7 +323,7 @@ def _relative(row: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
 
 
 def _ordered(names: set[str]) -> list[str]:
-    """The known controllers in their order, then others by name."""
+    """Order names: the known controllers in their order, then others by name."""
     return [name for name in CONTROLLERS if name in names] + sorted(names - set(CONTROLLERS))
 
 
@@ -336,7 +335,7 @@ def _style(name: str) -> dict[str, Any]:
 
 
 def _legend(figure: Figure, ax: Axes, present: Sequence[str]) -> None:
-    """A legend in the order of the controllers, whichever task each of them has."""
+    """Add a legend in the order of the controllers, which does not depend on the tasks."""
     for name in present:
         label = CONTROLLERS[name][0] if name in CONTROLLERS else plain(name)
         ax.plot([], [], linestyle="", label=label, **_style(name))

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 LEVEL = COLOURS["hybrid"]
 AVERAGES = (("short average", PALE, ":"), ("long average", LEVEL, "--"))
-"""Label, colour and line of the thresholds of a channel's means, the shortest first."""
+"""Label, colour and line style of a channel's moving averages, the shortest first."""
 NOTES, WIDTH = 6, 130
-"""Most notes that stand below a title, and characters of one line."""
+"""Maximum notes below a title, and characters of a line."""
 
 
 def channels(
@@ -50,19 +50,19 @@ def channels(
     marks: Sequence[tuple[float, str]] = (),
     title: str = "",
 ) -> Figure:
-    """The channels of a monitor over a recording, a panel each, the share of the thresholds, and the measured outputs.
+    """Channels of a monitor over a recording, the largest ratio to a threshold, and the measured outputs.
 
-    A channel whose limits compare means shows these with their thresholds, any other its values. Alarms of a channel
-    are shaded in its panel, all of them in the last ones.
+    A channel with thresholds for moving averages shows these averages and thresholds; any other channel shows its
+    values. A channel's alarms are shaded in its own panel. All alarms are shaded in the last panels.
 
     Args:
-        trace: What :func:`hybrid_mpc.watch.replay.replay` returned.
+        trace: Result of :func:`hybrid_mpc.watch.replay.replay`.
         y: Measured outputs ``(n, n_y)``.
-        outputs: Their signals.
-        limits: What the channels were compared with. Default: nothing.
-        windows: Stretches [s] known to be undisturbed, as bars. Default: none.
-        notes: Times [s] and what to write there, e.g. a diagnosis. Default: none.
-        marks: Times [s] of vertical lines, and what is written beside them. Default: none.
+        outputs: Signals of ``y``.
+        limits: Thresholds of the channels. Default: none drawn.
+        windows: Stretches [s] known to be undisturbed, drawn as bars. Default: none.
+        notes: Times [s] and texts, such as a diagnosis; listed below the title. Default: none.
+        marks: Times [s] and labels of vertical lines. Default: none.
         title: Title. Default: none.
 
     Returns:
@@ -115,13 +115,13 @@ def channels(
         for (time, _), style in zip(marks, cycle(("-", ":", "-.")), strict=False):
             ax.axvline(time, color=INK, linestyle=style, linewidth=1.2)
     _marks(panels[-1], marks, 0.5 * float(t[0] + t[-1]))
-    _headed(panels[0], title, notes)
+    _write_head(panels[0], title, notes)
     finish_column(figure, panels)
     return figure
 
 
-def _headed(ax: Axes, title: str, notes: Sequence[tuple[float, str]]) -> None:
-    """Title, and below it the notes, each with the number that marks its time: their texts are longer than a panel."""
+def _write_head(ax: Axes, title: str, notes: Sequence[tuple[float, str]]) -> None:
+    """Write the title, below it the notes (too long for a panel), and each note's number at its time."""
     for number, (time, _) in enumerate(notes, 1):
         place: Any = {
             "xycoords": ("data", "axes fraction"),
@@ -154,7 +154,7 @@ def _shade(ax: Axes, spans: Sequence[tuple[float, float]], label: str, **style: 
 
 
 def _scores(ax: Axes, trace: Trace) -> None:
-    """The largest share of a threshold, on a scale that shows what is far beyond it too."""
+    """Draw the largest ratio to a threshold, linear up to 2 and logarithmic beyond."""
     ax.plot(trace.t, trace.share, color=LEVEL, linewidth=1.2)
     ax.axhline(1.0, color="black", linestyle="--", linewidth=1.2, label="threshold")
     ax.set_yscale("symlog", linthresh=2.0, linscale=2.0)
@@ -164,7 +164,7 @@ def _scores(ax: Axes, trace: Trace) -> None:
 
 
 def _marks(ax: Axes, marks: Sequence[tuple[float, str]], middle: float) -> None:
-    """What the vertical lines are, one below the other, on the side with more room."""
+    """Write the labels of the vertical lines one below the other, on the side with more room."""
     for i, (time, text) in enumerate(marks):
         side = 1 if time < middle - 1e-9 else -1
         ax.annotate(

@@ -1,4 +1,4 @@
-"""Figures of studies: how costs are distributed, paired differences, cost against solve time."""
+"""Figures of studies: distributions of a cost, paired differences, cost against solve time."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ Values = Mapping[str, Mapping[str, Array]]
 
 
 def distributions(values: Values, label: str) -> Figure:
-    """A figure's values over all runs: median, quartiles, and 5 to 95 %, one panel a group.
+    """Distribution of values over all runs: median, quartiles, and 5 to 95 %, one panel for each group.
 
     Args:
-        values: By group (a task) and level (a controller): values ``(n,)``; those not finite are left out.
+        values: By group (a task) and level (a controller): values ``(n,)``; values that are not finite are left out.
         label: Name and unit of the axis.
 
     Returns:
@@ -69,7 +69,7 @@ def distributions(values: Values, label: str) -> Figure:
 
 
 def differences(rows: Mapping[str, Mapping[str, tuple[float, float, float]]], label: str) -> Figure:
-    """Paired differences with their intervals, one panel a group, zero marked.
+    """Paired differences with their intervals, one panel for each group, with a line at zero.
 
     Args:
         rows: By group and level: difference, lower and upper end of its interval (NaN: not drawn).
@@ -99,7 +99,7 @@ def differences(rows: Mapping[str, Mapping[str, tuple[float, float, float]]], la
 
 
 def pareto(points: Mapping[str, Mapping[str, tuple[float, float]]], cost: str) -> Figure:
-    """Mean cost against the duration of a step, one panel a group; a line joins what nothing else beats in both.
+    """Mean cost against the duration of a step, one panel for each group; a line joins the Pareto-optimal points.
 
     Args:
         points: By group and level: median duration of a step [ms], mean cost.
@@ -144,7 +144,7 @@ def pareto(points: Mapping[str, Mapping[str, tuple[float, float]]], cost: str) -
 
 
 def _front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Points that no other is better than in both, by the first coordinate."""
+    """Pareto-optimal points (no other point is better in both coordinates), sorted by the first coordinate."""
     front: list[tuple[float, float]] = []
     for point in sorted(points):
         if not front or point[1] < front[-1][1]:
@@ -155,7 +155,7 @@ def _front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 def _panels(
     groups: Mapping[str, Mapping[str, object]], a_row: float, least: float = 1.4
 ) -> tuple[Figure, list[Axes]]:
-    """A panel a group, ``a_row`` inches a level high; those left over are hidden."""
+    """Create one panel for each group, with ``a_row`` inches for each level; hide unused panels."""
     columns = min(COLUMNS, max(1, len(groups)))
     rows = math.ceil(max(1, len(groups)) / columns)
     most = max((len(row) for row in groups.values()), default=1)
@@ -168,7 +168,7 @@ def _panels(
 
 
 def _rows(ax: Axes, names: Sequence[str]) -> None:
-    """Names of the rows, the first on top."""
+    """Label the rows, the first at the top."""
     ax.set_yticks(range(len(names)), [plain(name) for name in names], fontsize=8)
     ax.set_ylim(len(names) - 0.4, -0.6)
     ax.grid(False, axis="y")

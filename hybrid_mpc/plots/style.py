@@ -1,4 +1,4 @@
-"""One look for all figures: colours (Okabe-Ito, safe for colour-blind readers), names, saving."""
+"""The shared look of all figures: colours (Okabe-Ito, safe for colour-blind readers), names, saving."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ Share = bool | Literal["none", "all", "row", "col"]
 
 DPI = 110
 IN_PALETTE = 256
-"""Colours of a picture's palette: lines and their smoothed edges need no more, and the file is a third as large."""
+"""Colours of a PNG's palette: enough for lines and their smoothed edges; the file is a third as large as in RGB."""
 INK, FAINT, PALE = "#222222", "#8a8a8a", "#9a9a9a"
 MUTED = "#6b6b6b"
-"""Text that stands back; lines may be fainter, text on white may not (contrast 4.5 to 1)."""
+"""Colour of secondary text; text on white needs a contrast of 4.5 to 1, so lines may be fainter than text."""
 ALARM, GOOD = "#CC79A7", "#009E73"
 
 _ROLES = {
@@ -54,8 +54,8 @@ _ROLES = {
     "valid": ("#F0E442", "validation"),
     "test": ("#555555", "test"),
 }
-"""Colour and name of each role or model. A hybrid has one colour, whatever its networks were trained by and whether it
-runs freely or in a loop; beside a MOPGRNN, a PGRNN is dashed, and its bar is hatched."""
+"""Colour and name of each role or model. All hybrids share one colour, in free runs and in loops. The PGRNN is dashed
+and its bar is hatched, which separates it from the MOPGRNN."""
 COLOURS: Mapping[str, str] = MappingProxyType({role: ink for role, (ink, _) in _ROLES.items()})
 NAMES: Mapping[str, str] = MappingProxyType({role: name for role, (_, name) in _ROLES.items()})
 _DASHED = frozenset({"phy_nominal", "pgrnn", "reference"})
@@ -89,14 +89,15 @@ def name_of(role: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Text of a user as matplotlib prints it literally (a dollar sign starts no formula)."""
+    """Escape a user's text so that matplotlib prints it literally (a dollar sign starts no formula)."""
     return text.replace("$", r"\$")
 
 
 def line_style(role: str) -> dict[str, Any]:
-    """Keyword arguments of a line of a role: colour, dashes, width, order of drawing and legend name.
+    """Keyword arguments of a role's line: colour, dashes, width, drawing order and legend label.
 
-    A variant of a known role, ``"hybrid, reduced"``, has its colour, dashed, and lies above it.
+    A variant of a known role, such as ``"hybrid, reduced"``, is a dashed line in the role's colour, above the role's
+    line.
 
     Example:
         >>> line_style("phy_nominal")["linestyle"], line_style("prior, reduced")["label"]
@@ -117,7 +118,7 @@ def line_style(role: str) -> dict[str, Any]:
 
 
 def axis_label(signal: Signal) -> str:
-    """Label of an axis: symbol or name, and unit.
+    """Label of an axis: symbol or name of the signal, then its unit.
 
     Example:
         >>> axis_label(Signal("torque", "N m"))
@@ -148,15 +149,15 @@ def new_figure(
     sharey: Share = False,
     heights: Sequence[float] | None = None,
 ) -> tuple[Figure, NDArray[np.object_]]:
-    """An empty figure in the project's look, and its axes ``(rows, cols)``.
+    """Create an empty figure in the project's look, with its axes ``(rows, cols)``.
 
     Args:
         rows: Rows of axes.
         cols: Columns of axes.
         title: Title over all axes. Default: none.
-        size: Width and height [inch]. Default: 10 wide, 2.2 a row and at least 3.6 high.
+        size: Width and height [inch]. Default: width 10, height 2.2 for each row and at least 3.6.
         sharex: As in ``matplotlib.figure.Figure.subplots``.
-        sharey: Likewise.
+        sharey: As in ``matplotlib.figure.Figure.subplots``.
         heights: Relative heights of the rows. Default: equal.
 
     Returns:
@@ -182,7 +183,7 @@ def new_figure(
 def new_column(
     heights: Sequence[float], *, height: float = 1.2, title: str = ""
 ) -> tuple[Figure, list[Axes]]:
-    """An empty figure of panels one above the other that share their horizontal axis.
+    """Create an empty figure whose panels lie one above the other and share their horizontal axis.
 
     ``heights`` are relative; a panel of relative height 1 is ``height`` inches high.
     """
@@ -192,7 +193,7 @@ def new_column(
 
 
 def finish_column(figure: Figure, panels: Sequence[Axes], *, columns: int = 7) -> None:
-    """Complete a column of panels over time: no margins, time axis, aligned labels, one legend."""
+    """Complete a column of panels over time: remove margins, label the time axis, align labels, add one legend."""
     for ax in panels:
         ax.margins(x=0)
     panels[-1].set_xlabel("time [s]")
@@ -201,7 +202,7 @@ def finish_column(figure: Figure, panels: Sequence[Axes], *, columns: int = 7) -
 
 
 def plot_inputs(panels: Sequence[Axes], t: Array, u: Array, inputs: Sequence[Signal], **style: Any) -> None:
-    """Inputs ``(n, n_u)``, held between samples, one panel each."""
+    """Draw inputs ``(n, n_u)``, held between samples, one panel for each input."""
     look: dict[str, Any] = {"color": INK, "linewidth": 1.0} | style
     for ax, values, signal in zip(panels, u.T, inputs, strict=True):
         ax.plot(t, values, drawstyle="steps-post", **look)
@@ -222,16 +223,16 @@ def dress(ax: Axes) -> None:
 
 
 def title_axes(ax: Axes, text: str) -> None:
-    """Small title at the left edge of axes."""
+    """Set a small title at the left edge of axes."""
     ax.set_title(text, loc="left", fontsize=10, color=INK)
 
 
 def shared_legend(figure: Figure, *, columns: int = 7, ink: bool = False) -> None:
-    """One legend beneath all axes of a figure, each name once, in order of first appearance.
+    """Add one legend below all axes of a figure; each label appears once, in the order of drawing.
 
     Args:
         figure: The figure.
-        columns: Most columns.
+        columns: Maximum number of columns.
         ink: True: the legend shows the dashes of lines and not their colours.
     """
     seen: dict[str, Any] = {}
@@ -250,7 +251,7 @@ def shared_legend(figure: Figure, *, columns: int = 7, ink: bool = False) -> Non
 
 
 def plain_log(axis: Axis, lowest: float, highest: float) -> None:
-    """Plain numbers (0.1, 1, 10) on a logarithmic axis; 2 and 5 as well where it spans little."""
+    """Print plain numbers (0.1, 1, 10) on a logarithmic axis, and also 2 and 5 on one of less than two decades."""
     narrow = highest < 100 * lowest
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -258,7 +259,7 @@ def plain_log(axis: Axis, lowest: float, highest: float) -> None:
 
 
 def number(value: float) -> str:
-    """A number as figures and tables print it: three significant digits.
+    """Format a number for figures and tables: three significant digits.
 
     Example:
         >>> number(0.0255), number(1.023e-4), number(50.0)
@@ -273,27 +274,28 @@ def number(value: float) -> str:
 
 
 def checked(name: str, values: Any, length: int, columns: int | None = None) -> Array:
-    """An array of a figure, its shape checked: ``(length,)``, or ``(length, columns)`` where those are given."""
+    """Convert values to an array and check its shape: ``(length,)``, or ``(length, columns)`` with ``columns``."""
     array = np.asarray(values, dtype=float)
     if columns is not None and array.ndim == 1:
         array = array[:, None]
     needed = (length,) if columns is None else (length, columns)
     if array.shape != needed:
         raise InputError(
-            f"plot: {name} has shape {array.shape}, its time axis and signals need {needed} [HM-PLOTS-032]"
+            f"plot: {name} has shape {array.shape}; its time axis and signals need {needed} [HM-PLOTS-032]"
         )
     return array
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write a figure as PNG: all of it or nothing, and the same bytes for the same data.
+    """Write a figure as PNG. The file is written completely or not at all; the same data give the same bytes.
 
     Args:
         figure: The figure.
-        path: Target file, ``.png``; its folder is made if missing.
+        path: Target file, ``.png``; a missing folder is created.
 
     Raises:
-        InputError: If the name does not end in ``.png``, or the file cannot be written.
+        InputError: If the name does not end in ``.png``.
+        StorageError: If the file cannot be written.
 
     Example:
         >>> import tempfile
@@ -306,7 +308,7 @@ def save(figure: Figure, path: str | Path) -> Path:
         raise InputError(f"figure {path}: figures are written as PNG; end the name in .png [HM-PLOTS-033]")
     drawn = io.BytesIO()
     with warnings.catch_warnings():
-        # names of anybody's may have characters that the font lacks; the warning would print them as they are
+        # a user's name may have characters that the font lacks; matplotlib's warning would print them unescaped
         warnings.filterwarnings("ignore", "Glyph .* missing from")
         figure.savefig(drawn, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
     picture = Image.open(drawn).convert("RGB").quantize(IN_PALETTE, dither=Image.Dither.NONE)

@@ -1,4 +1,4 @@
-"""Figures of ``hybrid-mpc tune``: the validation error of each trial, and over each setting."""
+"""Figures of ``hybrid-mpc tune``: validation error over the trials, and over each setting."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hybrid_mpc.plots.style import FAINT, INK, new_figure, plain, plain_log, sha
 
 STATES: Mapping[str, tuple[str, str, str]] = {
     "complete": ("o", "#0072B2", "finished"),
-    "pruned": ("x", "#E69F00", "pruned: the error at its end"),
+    "pruned": ("x", "#E69F00", "pruned: last error"),
     "diverged": ("v", "#CC79A7", "diverged (at the upper edge)"),
 }
 """Marker, colour and legend of each state of a trial."""
@@ -27,7 +27,7 @@ class Trial(Protocol):
 
     @property
     def number(self) -> int:
-        """0, 1, ..."""
+        """Number of the trial: 0, 1, ..."""
 
     @property
     def state(self) -> str:
@@ -43,9 +43,9 @@ class Trial(Protocol):
 
 
 def history(trials: Sequence[Trial], *, base: float | None = None) -> Figure:
-    """Validation error over the number of the trial, with the best so far.
+    """Validation error over the number of the trial, with the best error so far.
 
-    ``base`` is the validation error of the settings that the search started from; by default it is not drawn.
+    ``base`` is the validation error of the initial settings; by default it is not drawn.
     """
     figure, axes = new_figure(1, 1)
     ax = axes[0, 0]
@@ -63,9 +63,11 @@ def history(trials: Sequence[Trial], *, base: float | None = None) -> Figure:
 
 
 def settings(trials: Sequence[Trial], names: Sequence[str]) -> Figure:
-    """Validation error over each searched setting, one panel a setting."""
+    """Validation error over each searched setting, one panel for each setting."""
     if not names:
-        raise InputError("plot of a search: no setting to draw; give the searched ones [HM-PLOTS-034]")
+        raise InputError(
+            "plot of a search: no setting to draw; pass the names of searched settings [HM-PLOTS-034]"
+        )
     figure, axes = new_figure(1, len(names), sharey=True)
     for ax, name in zip(axes[0], names, strict=True):
         at = [float(trial.values[name]) for trial in trials]
@@ -79,11 +81,11 @@ def settings(trials: Sequence[Trial], names: Sequence[str]) -> Figure:
 
 
 def _points(ax: Axes, trials: Sequence[Trial], at: Sequence[float]) -> None:
-    """One point a trial on a logarithmic axis; an infinite value lies at the upper edge."""
+    """Draw one point for each trial on a logarithmic axis; an infinite value lies at the upper edge."""
     finite = [trial.value for trial in trials if math.isfinite(trial.value) and trial.value > 0]
     if not finite:
         raise InputError(
-            "plot of a search: no trial has a finite validation error; there is nothing to draw"
+            "plot of a search: no trial has a finite, positive validation error; there is nothing to draw"
             " [HM-PLOTS-035]"
         )
     low, high = min(finite) / 1.08, max(finite) * 1.08

@@ -1,4 +1,4 @@
-"""The page of a report: one self-contained HTML file of key figures, text, tables and embedded figures."""
+"""The page of a report: one self-contained HTML file with key figures, text, tables and embedded figures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Verdict = Literal["good", "bad", "plain"]
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """A number (or a word) at the head of the report; None shows a dash, ``comment`` says why."""
+    """A number or word at the top of the report; None is shown as a dash, and ``comment`` gives the reason."""
 
     label: str
     value: Cell
@@ -37,7 +37,7 @@ class KeyFigure:
 
 @dataclass(frozen=True)
 class Answer:
-    """A question at the head of the report, its answer in a few words, and the figures behind it, a line each."""
+    """A question at the top of the report: verdict, answer in a few words, and one line for each supporting figure."""
 
     question: str
     verdict: Verdict
@@ -47,7 +47,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Hint:
-    """What to do next: a verdict (``"bad"`` needs the reader), what was found, and a remedy, which may be empty."""
+    """An entry of "What to do next": verdict (``"bad"``: the reader must act), finding, and remedy or ``""``."""
 
     verdict: Verdict
     finding: str
@@ -56,7 +56,7 @@ class Hint:
 
 @dataclass(frozen=True)
 class Table:
-    """A table: heads with units, cells (numbers get three significant digits, None a dash), a sentence about it."""
+    """A table: column heads with units, cells, and a caption. Numbers have three significant digits; None is a dash."""
 
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
@@ -66,12 +66,12 @@ class Table:
         for i, row in enumerate(self.rows):
             if len(row) != len(self.columns):
                 raise InputError(
-                    f"table {self.caption!r}: row {i} has {len(row)} cells, "
-                    f"its {len(self.columns)} columns need one each [HM-REPORT-001]"
+                    f"table {self.caption!r}: row {i} has {len(row)} cells; "
+                    f"the {len(self.columns)} columns need one cell each [HM-REPORT-001]"
                 )
 
     def filled(self) -> Table:
-        """The table without columns that have nothing but dashes.
+        """Return the table without the columns that hold only dashes.
 
         Example:
             >>> Table(("task", "rise [s]", "offset"), (("step", None, 0.1), ("hold", "–", None))).filled().columns
@@ -82,7 +82,7 @@ class Table:
         return Table(tuple(self.columns[i] for i in kept), rows, self.caption)
 
     def csv(self) -> str:
-        r"""The table as CSV: a header, numbers with all their digits, nothing for None.
+        r"""Return the table as CSV: a header, numbers with all digits, an empty cell for None.
 
         Example:
             >>> Table(("model", "x [rad]"), (("prior", 0.1), ("a, b", None))).csv()
@@ -98,10 +98,10 @@ class Table:
 class Section:
     """A section: text, tables, figures with captions, and notes after them.
 
-    A figure with a file ``NAME.json`` beside it (:func:`~hybrid_mpc.plots.interactive.write_interactive`) can be looked
-    at more closely in the browser.
+    A figure with a file ``NAME.json`` beside it (:func:`~hybrid_mpc.plots.interactive.write_interactive`) is also shown
+    in its interactive form.
 
-    Of the text a plain ``str`` is escaped; ``markupsafe.Markup`` is taken as HTML.
+    A plain ``str`` is escaped; ``markupsafe.Markup`` is inserted as HTML.
     """
 
     title: str
@@ -112,16 +112,16 @@ class Section:
 
     @property
     def anchor(self) -> str:
-        """Name of the section within the page."""
+        """Anchor of the section within the page."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
 
 
 @dataclass(frozen=True)
 class Report:
-    """A page: titles, a paragraph about the machine, the command that made it, key figures, hints, sections.
+    """A page: titles, a paragraph about the machine, the command that made the page, key figures, hints, sections.
 
-    ``remark`` is a line under the title: seed, budget, versions. ``doubt`` stands above it: what a reader must know
-    before anything else on the page; empty: nothing. ``answers`` come first, before the machine.
+    ``remark`` is a line under the title: seed, budget, versions. ``doubt`` stands above ``remark``: a warning that a
+    reader must see first; empty for none. ``answers`` come first, before the machine.
     """
 
     title: str
@@ -137,10 +137,11 @@ class Report:
 
 
 def write_report(path: str | Path, report: Report) -> Path:
-    """Write a report as one self-contained HTML file, all of it or nothing; the path.
+    """Write a report as one self-contained HTML file, completely or not at all; return its path.
 
     Raises:
-        InputError: If a figure is missing or is no PNG or GIF, or the page cannot be written.
+        InputError: If a figure is missing or is not a PNG or GIF file.
+        StorageError: If the page cannot be written.
     """
     path = Path(path)
     write_text(path, render(report))
@@ -148,7 +149,7 @@ def write_report(path: str | Path, report: Report) -> Path:
 
 
 def render(report: Report) -> str:
-    """The report as HTML text.
+    """Convert a report to HTML text.
 
     Example:
         >>> "<title>Report &amp; more</title>" in render(Report("Report & more", "", "", ""))
@@ -166,14 +167,14 @@ def render(report: Report) -> str:
 
 
 def _library() -> Markup:
-    """What draws interactive figures in a browser, as text: the page needs no network."""
+    """JavaScript of the library that draws interactive figures; the page holds it, so it needs no network."""
     from bokeh.resources import Resources
 
     return Markup("\n".join(Resources(mode="inline", components=["bokeh"]).js_raw))
 
 
 def words(file: str) -> dict[str, tuple[Markup, ...]]:
-    """General texts of the sections of a page, from a template with a block for each section.
+    """General texts of a page's sections, from a template with one block for each section.
 
     Example:
         >>> len(words("run_words.html")["training"])
@@ -199,7 +200,7 @@ def _template(file: str) -> Template:
 
 
 def cell(value: Cell) -> str:
-    """A table's cell as text.
+    """Format a table's cell as text.
 
     Example:
         >>> cell(None), cell(True), cell(3), cell(0.0255), cell("RNN")
@@ -209,12 +210,12 @@ def cell(value: Cell) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    # a per cent sign stays with its number
+    # a no-break space keeps a per cent sign with its number
     return number(value) if isinstance(value, float) else str(value).replace(" %", "\u00a0%")
 
 
 def is_number(value: Cell) -> bool:
-    """True for a cell that is set to the right."""
+    """True for a cell that is aligned right."""
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
@@ -222,14 +223,16 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise InputError(
-            f"report, section {section.title!r}: no figure {path}; draw it first, or leave it out [HM-REPORT-002]"
+            f"report, section {section.title!r}: the figure {path} does not exist. Draw it first, or leave it out"
+            " [HM-REPORT-002]"
         )
     try:
         with Image.open(path, formats=("PNG", "GIF")) as image:
             kind, (width, height) = str(image.format).lower(), image.size
     except UnidentifiedImageError:
         raise InputError(
-            f"report, section {section.title!r}: figure {path} is not a PNG or GIF file; give one [HM-REPORT-003]"
+            f"report, section {section.title!r}: the figure {path} is not a PNG or GIF file. Save it in one of these"
+            " formats [HM-REPORT-003]"
         ) from None
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     live = path.with_suffix(".json")
@@ -238,6 +241,6 @@ def _figure(section: Section, path: str | Path, caption: str) -> dict[str, Any]:
         "caption": caption,
         "width": width,
         "height": height,
-        # nothing in the text ends the script that holds it
+        # without "<", no text can end the script element that holds it
         "live": Markup(live.read_text("utf-8").replace("<", "\\u003c")) if live.is_file() else "",
     }

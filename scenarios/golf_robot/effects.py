@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 SMOOTHING = 0.25
 """Window [s] of the differentiation, the scenario's own: noise and bias in the acceleration together are least
-between 0.2 and 0.25 s (see docs/machines/golf_robot_rig.md)."""
+between 0.2 and 0.25 s (see docs/results/golf_robot.md)."""
 MOVING = 0.05  # [rad/s]
 PUBLISHED = {p.name: p.value for p in PARAMETERS}
 FREE = [p for p in PARAMETERS if not p.fixed]

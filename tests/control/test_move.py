@@ -55,6 +55,23 @@ def test_a_second_that_costs_little_lets_the_move_be_gentle():
         assert duration[price] == pytest.approx((36 / price) ** 0.25, rel=0.05)
 
 
+@pytest.mark.parametrize("what", ["x", "y"])
+def test_an_input_that_acts_late_takes_as_many_periods_more(what):
+    """A chain of three delays and an integrator: in plans of up to three periods no input reaches the target."""
+    late = linear_model(
+        np.array([[1.0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 0]]), np.eye(4)[:, 3:], np.eye(4)[:1]
+    )
+    goal = np.array([2.0]) if what == "y" else np.array([2.0, 0.0, 0.0, 0.0])
+    width = 1e-3 if what == "y" else np.array([1e-3, 2.0, 2.0, 2.0])
+    ocp = OCP(10, np.full(4, 1e-3), [1e-3], [0.0], [-1.0], [1.0])
+    move = shortest_move(
+        late, ocp, estimate_of(late, np.zeros(4)), HardBound(what, goal - width, goal + width, at_end=True),
+        reference=[2.0, 0.0, 0.0, 0.0],
+    )  # fmt: skip
+    # outputs are bounded before the last period, states after it; two periods at the limit move 2
+    assert len(move.u) == (6 if what == "y" else 5)
+
+
 def test_within_the_target_a_period_is_enough():
     move = shortest_move(MODEL, problem(), estimate_of(MODEL, [0.5, 0.0]), rest_at(0.5))
     assert len(move.u) == 1

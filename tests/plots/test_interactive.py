@@ -74,6 +74,8 @@ def test_it_holds_what_was_drawn(drawn, tmp_path):
         ]
         assert sum(near) == 1  # in single precision
     assert len(found["Patches"]) >= 1
+    # dragging sideways enlarges a stretch of time in all panels, whose vertical axes stay
+    assert [tool["dimensions"] for tool in found["BoxZoomTool"]] == ["width"] * 2
     assert [b["right"] for b in found["BoxAnnotation"] if b.get("left") == 0.5] == [
         1.0
     ]  # others are of the tools

@@ -234,5 +234,5 @@ def test_the_whole_job(tmp_path):
     assert results["export"]["parity_max_abs_error"] <= 1e-12
     error, control = results["identification"]["error"], results["control"]
     assert error["phy"] == error["phy_nominal"]  # the prior is not fitted
-    assert error["mopgrnn"] < 0.1 * error["phy"]  # docs/machines/pendulum.md: 0.01 of the prior's
+    assert error["mopgrnn"] < 0.1 * error["phy"]  # docs/results/simulated_machines.md: 0.01 of the prior's
     assert control["hybrid"]["cost"] < 0.5 * control["prior"]["cost"]

@@ -105,8 +105,8 @@ class ControlResult:
 
     Args:
         rows: The loops by task, controller and seed.
-        reason: Why there are none, where only steps could be timed. Default: there are loops.
-        arrays: Signals that are drawn, ``"NUMBER/NAME"`` with the number of the row; without loops ``step_ms``.
+        reason: Why there are no loops, if only steps were timed. Default: there are loops.
+        arrays: Signals for the figures, ``"NUMBER/NAME"`` with the number of the row; without loops ``step_ms``.
     """
 
     rows: tuple[LoopRow, ...]
@@ -115,12 +115,12 @@ class ControlResult:
 
     @property
     def drawn(self) -> list[LoopRow]:
-        """The loops whose signals were kept, with these."""
+        """The loops whose signals were kept, with their signals."""
         return [row for row in with_arrays(self.rows, self.arrays) if row.arrays] if self.rows else []
 
 
 def control_stage(context: Context) -> ControlResult | Absent:
-    """Closed loops of every task with prior, hybrid and oracle; without a plant only the timing of steps."""
+    """Simulate closed loops of every task with prior, hybrid and oracle; without a plant, only time the steps."""
     if context.scenario.control is None:
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     context.read(NOISE)
@@ -131,7 +131,7 @@ def control_stage(context: Context) -> ControlResult | Absent:
 
 
 def compare(context: Context) -> list[LoopRow]:
-    """Run the loops on the run's model; the timed ones alone, the others side by side in processes.
+    """Run the loops on the run's model: timed loops one by one, the others in parallel processes.
 
     A task gets no more seeds once its comparison of hybrid and better baseline is decided
     (:mod:`hybrid_mpc.compare.sequential`). Every finished part is written, so an interrupted run does not repeat it.
@@ -201,7 +201,7 @@ def time_on_recording(
 def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
     if name not in ORACLES:
         return seeds
-    # with the true state no measurement is used: seeds differ only by the rival plans of BestOf
+    # an oracle with the true state uses no measurement, so seeds only change the rival plans of BestOf
     return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
 
 

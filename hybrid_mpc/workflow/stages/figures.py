@@ -84,7 +84,7 @@ def _draw(context: Context, parts: Sequence[Callable[[Context], Any]]) -> Figure
 
 def _saved(figure: Figure, path: Path) -> Path:
     """Save a picture, and its interactive form beside it if its axis is time."""
-    path.with_suffix(".json").unlink(missing_ok=True)  # of another picture of this name
+    path.with_suffix(".json").unlink(missing_ok=True)  # it may belong to an older picture of this name
     save(figure, path)
     if over_time(figure):
         write_interactive(figure, path)
@@ -120,7 +120,7 @@ def _data(context: Context) -> Any:
     pieces = [t for t in context.dataset.trajectories if t.role != "nominal"]
     figure = data.recordings(pieces, prior.outputs, prior.inputs, disturbances=prior.disturbances)
     yield "data", "recordings", figure, "Recordings and the use of each part."
-    parts = {role: context.smoothed(role) for role in ("train", "test")}  # states that no sensor sees, too
+    parts = {role: context.smoothed(role) for role in ("train", "test")}  # includes unmeasured states
     smoothed = [t for part in parts.values() for t in part]
     caption = (
         "Training and test data in the state space." if prior.kinematics else "Estimated states over time."
@@ -377,7 +377,7 @@ def _analysis(context: Context) -> Any:
     titles = {"rest": f"at rest{friction}", "moving": "at working speed"}
     for point in ("rest", "moving"):
         if any(point not in found.models[n].points for n in poles):
-            continue  # a network that corrects every rate leaves no speed that is one
+            continue  # a network that corrects every rate leaves no signal that is exactly a speed
         for (i, output), (j, into) in product(enumerate(prior.outputs), enumerate(prior.inputs)):
             responses = {}
             for n in poles:

@@ -333,8 +333,8 @@ def examined_prior(context: Context) -> PriorResult:
     if own["phy"] >= own["constant"]:
         seen, mean = judge.errors(every[: len(train)], longest_run)
         training = {"phy": seen["phy"].error, "constant": _error_of(mean["constant"])}
-    # an unstable machine is recorded under its controller: there the inputs alone predict the outputs, so linear
-    # models look better than they are
+    # an unstable machine is recorded in closed loop: the controller's inputs depend on the outputs, so linear models
+    # predict the outputs from the inputs and look better than they are
     compared = baselines if not growth else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
     acting, unit = shifted(train, fit.delay), context.time_unit

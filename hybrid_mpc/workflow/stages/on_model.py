@@ -41,7 +41,7 @@ class OnModelResult:
 
     @property
     def drawn(self) -> list[LoopRow]:
-        """The loops whose signals were kept, with these."""
+        """The loops whose signals were kept, with their signals."""
         return [row for row in with_arrays(self.rows, self.arrays) if row.arrays]
 
 
