@@ -205,12 +205,17 @@ def choose_tracked(
     floors = [np.maximum(rmse, 1e-12 * np.maximum(rmse.max(axis=0), 1e-300)) for rmse, _ in plain]
     tried: dict[str, float] = {}
 
-    def judged(chosen: Sequence[TrackedParameter]) -> tuple[float, Array]:
-        """Mean ratio of errors over recordings and outputs, and that of each output: the worst of the sets."""
-        outputs = []
+    def judged(chosen: Sequence[TrackedParameter], needed: float = math.inf) -> tuple[float, Array]:
+        """Mean ratio of errors over recordings and outputs, and that of each output: the worst of the sets.
+
+        Sets behind one whose ratio is above ``needed`` are left out: they could not help.
+        """
+        outputs: list[Array] = []
         for one, floor, (_, starts) in zip(sets, floors, plain, strict=True):
             ratio = np.clip(errors(one, chosen)[0] / floor, 1.0 / FAR, FAR)
             outputs.append(np.average(np.log(ratio), axis=0, weights=starts))
+            if math.exp(float(outputs[-1].mean())) > needed:
+                break
         mean = math.exp(float(np.max([o.mean() for o in outputs])))
         tried[", ".join(one.name for one in chosen)] = mean
         return mean, np.exp(np.max(outputs, axis=0))
@@ -230,7 +235,7 @@ def choose_tracked(
         trials = [(*best, one) for name, one in pool.items() if name not in have]
         trials += [one for one in together if len(one) > len(best) + 1]
         together = []
-        found = [(*judged(trial), trial) for trial in trials]
+        found = [(*judged(trial, BETTER * ratio), trial) for trial in trials]
         harmless = [one for one in found if (one[1] <= np.maximum(HARM, HARM * outputs)).all()]
         first = min(harmless, key=lambda one: one[0], default=None)
         if first is None or first[0] > BETTER * ratio:

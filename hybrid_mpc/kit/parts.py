@@ -5,7 +5,7 @@ file                           content                                          
 =============================  ============================================================  ==============
 ``kit.json``                   machine, signals, provenance, default model                   ``export``
 ``models/``                    programs and weights of the models                            ``export``
-``observer.json``              noise of sensors and states, disturbance model                ``noise``
+``observer.json``              noise of sensors and states, disturbances, tracked parameters ``noise``
 ``tasks.json``, ``tasks/``     common control problem, safe input; problems of single tasks  ``tasks``
 ``watch/NAME.json``            limits of all channels of the monitor with a model            ``watch``
 ``promises.json``              promises of the kit (:mod:`hybrid_mpc.kit.promises`)          ``promises``
