@@ -188,7 +188,7 @@ def find_varying(
     evidence = _Evidence(np.array([a for a, _ in quadratics]), np.array([c for _, c in quadratics]))
     unit_of = scale * of.unit  # from deviations to the parameters' units
     wanted = [p.varies for p in of.free]
-    given = np.array([float(v) if _is_number(v) else math.nan for v in wanted]) / unit_of
+    given = np.array([math.nan if v is None or isinstance(v, bool) else v for v in wanted]) / unit_of
     std, alone, gain = _chosen(evidence, [v is False for v in wanted], [v is True for v in wanted], given)
     found = tuple(
         VaryingParameter(
@@ -198,10 +198,6 @@ def find_varying(
         for p, s, a, g, u, r in zip(of.free, std, alone, gain, unit_of, relative, strict=True)
     )  # fmt: skip
     return Varying(found, len(pieces), blocks)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, float | int) and not isinstance(value, bool)
 
 
 def _pieces(known: Sequence[Trajectory]) -> tuple[list[list[Trajectory]], bool]:
@@ -249,13 +245,13 @@ class _Evidence:
         """Log evidence, the means ``(k,)``, their covariance, and the inverse of ``I + V^1/2 A V^1/2``."""
         root, eye = np.sqrt(variances), np.eye(len(variances))
         inner = eye + root[:, None] * self.a * root
-        inverse = np.linalg.inv(inner)
+        inverse: Array = np.asarray(np.linalg.inv(inner), dtype=np.float64)
         left = (self.a * root) @ inverse
         k = self.a - left @ np.swapaxes(self.a * root, 1, 2)  # (A^-1 + V)^-1
         shown = self.c - np.einsum("rij,rj->ri", left, root * self.c)
         both, total = k.sum(axis=0) + WEAK**-2 * eye, shown.sum(axis=0)
-        covariance = np.linalg.inv(both)
-        mean = covariance @ total
+        covariance: Array = np.asarray(np.linalg.inv(both), dtype=np.float64)
+        mean: Array = np.asarray(covariance @ total, dtype=np.float64)
         own = np.einsum("ri,rij,rj->", root * self.c, inverse, root * self.c)
         size = np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(both)[1]
         return float(0.5 * (own + total @ mean - size)), mean, covariance, inverse
