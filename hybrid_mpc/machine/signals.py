@@ -97,7 +97,7 @@ class Parameter:
     lower: Bound
     upper: Bound
     description: Line = ""
-    varies: bool | float | None = None
+    varies: bool | Number | None = None
 
     def __post_init__(self) -> None:
         own = Fields(self, f"parameter {self.label}")
@@ -106,7 +106,7 @@ class Parameter:
             f"value {self.value} is outside its bounds [{self.lower}, {self.upper}] [HM-MACHINE-022]",
         )  # fmt: skip
         own.need(
-            "varies", lambda: isinstance(self.varies, bool | None) or 0 < self.varies < math.inf,
+            "varies", lambda: self.varies is None or isinstance(self.varies, bool) or self.varies > 0,
             f"varies must be True, False or a positive standard deviation, got {self.varies} [HM-MACHINE-045]",
         )  # fmt: skip
         own.refuse()

@@ -114,8 +114,8 @@ def test_the_user_decides():
     assert own["gain"].declared
     assert own["bias"].std == pytest.approx(0.05)
     assert own["tau"].std > 0
-    for wrong in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match="HM-MACHINE-045"):
+    for wrong, code in ((0.0, "MACHINE-045"), (-1.0, "MACHINE-045"), (float("nan"), "RECORDS-012")):
+        with pytest.raises(InputError, match=code):
             Parameter("k", 1.0, "-", 0.0, 2.0, varies=wrong)
 
 
