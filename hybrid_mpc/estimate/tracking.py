@@ -88,7 +88,8 @@ def tracked_values(model: HybridModel, tracked: Sequence[TrackedParameter], thet
         p = _parameter(model, one.name)
         down, up = _room(p, one)
         saturated = up * ca.tanh(ca.fmax(t, 0) / up) + down * ca.tanh(ca.fmin(t, 0) / down)
-        found.append(p.value * ca.exp(saturated) if one.relative else p.value + saturated)
+        value = p.value * ca.exp(saturated) if one.relative else p.value + saturated
+        found.append(ca.fmin(ca.fmax(value, p.lower), p.upper))  # rounding, and a value at its bound
     return ca.vertcat(*found)
 
 

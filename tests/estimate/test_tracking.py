@@ -89,6 +89,16 @@ def test_a_parameter_stays_within_its_bounds():
     np.testing.assert_allclose(slope([0.0, 0.0]).full(), np.diag([2.0, 1.0]))
 
 
+def test_a_parameter_that_was_fitted_to_its_bound_stays_within():
+    model = tank(lower=2.0)
+    theta = ca.MX.sym("theta", 1)
+    for one in (GAIN, TrackedParameter("k", 0.5)):
+        values = ca.Function("values", [theta], [tracked_values(model, [one], theta)])
+        assert float(values(-1.0)) == 2.0
+        assert 2.0 < float(values(0.3)) <= 3.0
+        TrackingFilter(base(model, sigma_d=[0.01], sigma_d0=[0.1]), [one])  # its check goes to both sides
+
+
 def test_a_parameter_returns_to_its_value_in_its_time():
     tracking = TrackingFilter(base(tank()), [replace(GAIN, time=10.0)])
     estimate = watched(tracking)[-1]
