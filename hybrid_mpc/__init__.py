@@ -71,8 +71,12 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         parameter_states as parameter_states, with_parameter_states as with_parameter_states,
     )
     from hybrid_mpc.estimate.switching import SwitchingFilter as SwitchingFilter
+    from hybrid_mpc.estimate.tracking import (
+        TrackedParameter as TrackedParameter, TrackingFilter as TrackingFilter,
+    )
     from hybrid_mpc.estimate.tuning import process_noise as process_noise
     from hybrid_mpc.files import write_arrays as write_arrays
+    from hybrid_mpc.identify.ahead import errors_ahead as errors_ahead
     from hybrid_mpc.identify.evaluate import (
         evaluation_trajectories as evaluation_trajectories, free_runs as free_runs, score as score,
     )
@@ -91,6 +95,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     )
     from hybrid_mpc.identify.train import train as train
     from hybrid_mpc.identify.tune import SearchSpace as SearchSpace, tune as tune
+    from hybrid_mpc.identify.varying import find_varying as find_varying
     from hybrid_mpc.identify.windows import FirstStates as FirstStates
     from hybrid_mpc.check.preflight import check_scenario as check_scenario
     from hybrid_mpc.workflow.check_fit import check_fit as check_fit
@@ -206,8 +211,10 @@ _ROOMS = {
         "parameter_factors", "parameter_filter", "parameter_states", "with_parameter_states",
     ),
     "estimate.switching": ("SwitchingFilter",),
+    "estimate.tracking": ("TrackedParameter", "TrackingFilter"),
     "estimate.tuning": ("process_noise",),
     "files": ("write_arrays",),
+    "identify.ahead": ("errors_ahead",),
     "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),
     "identify.export": ("check_parity", "trace_model"),
     "identify.fit": ("fit_prior",),
@@ -220,6 +227,7 @@ _ROOMS = {
     "identify.step": ("HybridStep", "PriorStep", "Scaling", "n_features"),
     "identify.train": ("train",),
     "identify.tune": ("SearchSpace", "tune"),
+    "identify.varying": ("find_varying",),
     "identify.windows": ("FirstStates",),
     "kit.artifact": ("Kit", "load", "save_artifact"),
     "kit.assembly": (

@@ -83,11 +83,19 @@ def run(
             "--explain", help="First search for terms that the prior lacks, and use a prior with those found."
         ),
     ] = False,
+    track: Annotated[
+        bool,
+        typer.Option(
+            "--track",
+            help="Find the parameters that differ between recordings, for an observer that tracks them.",
+        ),
+    ] = False,
 ) -> None:
     """Fit the prior, train, export, close the loop, learn alarm limits, analyze, and write a report.
 
-    The stages are data, explain, prior, training, choice, evaluation, export, noise, control, on_model, estimation,
-    promises, watch, analysis and report. With --resume a stage runs again only if one of its inputs has changed.
+    The stages are data, explain, prior, training, choice, evaluation, export, track, noise, control, on_model,
+    estimation, promises, watch, analysis and report. With --resume a stage runs again only if one of its inputs has
+    changed.
     Exit code 1 if a stage after the export failed; the report gives the reason.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary, say
@@ -108,6 +116,7 @@ def run(
         device=device,
         deploy=deploy,
         explain=explain,
+        track=track,
     )
     with make_progress() as progress:
         results = run_job(

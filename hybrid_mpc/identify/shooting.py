@@ -331,6 +331,17 @@ class Shooting:
         point = self.start(theta, x, "all")
         return self._eliminated(replace(point, scale=self._left(point.error), held=1.0))[:2]
 
+    def scaled_slopes(self, theta: Array) -> tuple[Array, Array, Array]:
+        """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` from the best first states, these
+        eliminated, by the root of their robust weights [output units]; and the scale of each output's errors
+        ``(n_y,)``.
+        """
+        point = self.start(theta, self.first_states(theta), "all")
+        point = replace(point, scale=self._left(point.error), held=1.0)
+        slopes, error, *_ = self._eliminated(point)
+        unit = point.scales
+        return slopes * unit[:, None], error * unit, point.scale
+
     def _at(self, before: _Point, theta: Array, x: Array, slopes: Slopes) -> _Point:
         """Evaluate the outputs at another point; other fields are those of ``before``."""
         windows, seen, n, limit = self.windows, self.seen, len(x), LARGEST * self.spread

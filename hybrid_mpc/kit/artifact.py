@@ -19,6 +19,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, with_tracked
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.kit.assembly import (
     make_adaptive_guard,
@@ -59,7 +60,7 @@ from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import check_flag
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
-from hybrid_mpc.records import known
+from hybrid_mpc.records import known, plain
 from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
@@ -340,7 +341,9 @@ class Kit:
         own = f"{self.recommended}_observer"
         noise = {name: sigma for name, sigma in self.loop.process_noise.items() if name == own}
         loop = replace(self.loop, causes={}, tasks=(), safe_input=None, process_noise=noise)
-        return digest([self.programs_sha256, self.recommended, self.input_delay, loop])
+        plain_loop = plain(loop)
+        del plain_loop["tracked"]  # promises are those of loops that do not track
+        return digest([self.programs_sha256, self.recommended, self.input_delay, plain_loop])
 
     @property
     def name(self) -> str:
@@ -413,7 +416,8 @@ class Kit:
         if chosen is None and problem is not None and problem.n_y:
             name = "prior" if "prior" in self.models else self.recommended
             chosen = default_disturbances(_disturbed(self.models, None, name), problem)
-        return replace(self, loop=loop_settings(scenario, self.loop.process_noise)).with_disturbances(chosen)
+        loop = replace(loop_settings(scenario, self.loop.process_noise), tracked=self.loop.tracked)
+        return replace(self, loop=loop).with_disturbances(chosen)
 
     def with_disturbances(self, chosen: Sequence[Disturbance] | None) -> Kit:
         """A kit with another disturbance model (see ``Scenario``); None: one disturbance at each input."""
@@ -496,9 +500,42 @@ class Kit:
         found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
         return make_estimator(found, self, noise, self.problem(task), observer=load)
 
+    def tracking_observer(self, model: str = "", *, task: str = "", load: bool = True) -> TrackingFilter:
+        """:meth:`observer` that also tracks the parameters that differ between recordings (docs/tracking.md).
+
+        Its estimates belong to the model whose last measured disturbances are the tracked parameters; a loop needs the
+        controller of the same model, ``kit.controller(tracking=True)``.
+
+        Args:
+            model: Name of the model. Default: the recommended model.
+            task: As for :meth:`observer`.
+            load: As for :meth:`observer`.
+
+        Raises:
+            InputError: If the kit names no tracked parameters, or as :meth:`observer`.
+
+        Example:
+            ``loop = hm.Loop(kit.tracking_observer(), kit.controller(tracking=True), reference=[0.5])``
+        """
+        return TrackingFilter(self.observer(model, task=task, load=load), self._tracked())
+
+    def with_tracked(self, tracked: Sequence[TrackedParameter]) -> Kit:
+        """A kit whose :meth:`tracking_observer` tracks these parameters."""
+        return replace(self, loop=replace(self.loop, tracked=tuple(tracked)))
+
+    def _tracked(self) -> tuple[TrackedParameter, ...]:
+        if not self.loop.tracked:
+            raise InputError(
+                f"{self._whose}: no parameter is tracked, since tracking does not improve its predictions, or nothing "
+                "was found yet. Use kit.observer(), or name parameters: kit.with_tracked([TrackedParameter(...)]) "
+                "[HM-KIT-040]"
+            )
+        return self.loop.tracked
+
     def controller(
-        self, model: str = "", *, task: str = "", solver: str = "rti", iterations: int | None = None
-    ) -> SafeController:
+        self, model: str = "", *, task: str = "", solver: str = "rti", iterations: int | None = None,
+        tracking: bool = False,
+    ) -> SafeController:  # fmt: skip
         """The MPC of a model with its safeguards, which use the prior.
 
         Args:
@@ -507,15 +544,20 @@ class Kit:
             solver: ``"rti"``, ``"native"`` (the same as compiled C), ``"sqp"`` or ``"ipopt"``. Default: rti.
             iterations: Linearizations a period of ``rti``, or largest number of iterations a solve of ``sqp`` and
                 ``ipopt``; ``native`` always has one. Default: that of the solver, one for ``rti``.
+            tracking: Whether it plans with the parameters of :meth:`tracking_observer`. Default: False.
 
         Raises:
-            InputError: If model, task or solver are unknown, ``iterations`` is not possible, or the control problem is
-                missing.
+            InputError: If model, task or solver are unknown, ``iterations`` is not possible, the control problem is
+                missing, or ``tracking`` is requested and the kit names no tracked parameters.
         """
+        check_flag(tracking, "tracking")
+        models = self._model(model), self._model("prior")
+        if tracking:
+            planning, prior = (with_tracked(one, self._tracked()) for one in models)
+            models = planning, planning if models[0] is models[1] else prior
         return make_controller(
-            self._model(model), self._model("prior"), self.problem(task), solver=solver, iterations=iterations,
-            safe_input=self.safe_input,
-        )  # fmt: skip
+            *models, self.problem(task), solver=solver, iterations=iterations, safe_input=self.safe_input
+        )
 
     def monitor(self, model: str = "", *, kind: str = "", task: str = "") -> Monitor:
         """The monitor of a loop or a recording, with the limits learned by the run.

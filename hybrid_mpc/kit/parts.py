@@ -5,7 +5,7 @@ file                           content                                          
 =============================  ============================================================  ==============
 ``kit.json``                   machine, signals, provenance, default model                   ``export``
 ``models/``                    programs and weights of the models                            ``export``
-``observer.json``              noise of sensors and states, disturbance model                ``noise``
+``observer.json``              noise of sensors and states, disturbances, tracked parameters ``noise``
 ``tasks.json``, ``tasks/``     common control problem, safe input; problems of single tasks  ``tasks``
 ``watch/NAME.json``            limits of all channels of the monitor with a model            ``watch``
 ``promises.json``              promises of the kit (:mod:`hybrid_mpc.kit.promises`)          ``promises``
@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.tracking import TrackedParameter
 from hybrid_mpc.files import digest, is_file, read_document, read_object, reason, write_document
 from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.machine.signals import Parameter, Signal
@@ -186,6 +187,7 @@ class LoopSettings:
         safe_input: Input ``(n_u,)`` with which the machine may be left alone. Default: not declared.
         tasks: Names of the tasks, with or without a control problem of their own. Default: those of ``control``.
         disturbance_model: Unmeasured disturbances. Default: one at each input.
+        tracked: Parameters that :meth:`~hybrid_mpc.kit.artifact.Kit.tracking_observer` tracks. Default: none.
 
     Raises:
         InputError: If a field is of the wrong kind, a deviation is negative or not finite, a name of a task is not
@@ -200,6 +202,7 @@ class LoopSettings:
     safe_input: tuple[Number, ...] | None = None
     tasks: tuple[Name, ...] = ()
     disturbance_model: tuple[Disturbance, ...] | None = None
+    tracked: tuple[TrackedParameter, ...] = ()
 
     def __post_init__(self) -> None:
         own = Fields(self, "loop")
@@ -293,6 +296,7 @@ class ObserverSettings:
         disturbance_model: As in :class:`LoopSettings`.
         of: Digest of the models that the noise was estimated with (:attr:`Parts.models`). Empty: given by hand, valid
             for any models.
+        tracked: As in :class:`LoopSettings`. Default: none, as in kits of older versions.
     """
 
     sensor_sigma: tuple[NotNegative, ...] = ()
@@ -300,6 +304,7 @@ class ObserverSettings:
     process_noise: Mapping[Name, tuple[NotNegative, ...]] = field(default_factory=dict)
     disturbance_model: tuple[Disturbance, ...] | None = None
     of: Line = ""
+    tracked: tuple[TrackedParameter, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -423,7 +428,13 @@ def save_loop(folder: Path, loop: LoopSettings) -> None:
     write_tasks(folder, loop)
     write_observer(
         folder,
-        ObserverSettings(loop.sensor_sigma, loop.first_sigma, loop.process_noise, loop.disturbance_model),
+        ObserverSettings(
+            loop.sensor_sigma,
+            loop.first_sigma,
+            loop.process_noise,
+            loop.disturbance_model,
+            tracked=loop.tracked,
+        ),
     )
 
 
@@ -485,14 +496,14 @@ def read_parts(folder: Path) -> Parts:
     observer = held or ObserverSettings()
     loop = LoopSettings(
         control, observer.sensor_sigma, observer.first_sigma, observer.process_noise, tasks.causes, tasks.safe_input,
-        tasks.tasks, observer.disturbance_model,
+        tasks.tasks, observer.disturbance_model, observer.tracked,
     )  # fmt: skip
     parts = Parts(found, loop, {}, lacks)
     if held is None:
         lacks[OBSERVER] = _absent(OBSERVER)
     elif observer.of not in ("", parts.models):
         lacks[OBSERVER] = _stale(OBSERVER, "models")
-        parts = replace(parts, loop=replace(loop, process_noise={}))
+        parts = replace(parts, loop=replace(loop, process_noise={}, tracked=()))
     names = [path.stem for path in sorted((folder / "watch").glob("*.json"))]
     _check_models(names, found)
     watch = {}

@@ -79,9 +79,12 @@ class Parameter:
         lower: Lower bound of the fit [unit].
         upper: Upper bound of the fit [unit]. ``lower == upper`` keeps the parameter fixed.
         description: A few words, printed in tables.
+        varies: Whether the parameter differs between recordings (docs/tracking.md): True, False, or its standard
+            deviation between recordings [unit]. Default: the recordings decide.
 
     Raises:
-        InputError: With all problems: a field of a wrong kind, or a value outside its bounds.
+        InputError: With all problems: a field of a wrong kind, a value outside its bounds, or a standard deviation that
+            is not positive.
 
     Example:
         >>> Parameter("m", 0.5, "kg", 0.1, 2.0).fixed
@@ -94,12 +97,17 @@ class Parameter:
     lower: Bound
     upper: Bound
     description: Line = ""
+    varies: bool | Number | None = None
 
     def __post_init__(self) -> None:
         own = Fields(self, f"parameter {self.label}")
         own.need(
             "value lower upper", lambda: self.lower <= self.value <= self.upper,
             f"value {self.value} is outside its bounds [{self.lower}, {self.upper}] [HM-MACHINE-022]",
+        )  # fmt: skip
+        own.need(
+            "varies", lambda: self.varies is None or isinstance(self.varies, bool) or self.varies > 0,
+            f"varies must be True, False or a positive standard deviation, got {self.varies} [HM-MACHINE-045]",
         )  # fmt: skip
         own.refuse()
 

@@ -28,18 +28,20 @@ from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.workflow.stages.promises import PROMISES
 from hybrid_mpc.workflow.stages.report import REPORT, report_so_far
 from hybrid_mpc.workflow.stages.results import Results, read_results
+from hybrid_mpc.workflow.stages.track import TRACK
 from hybrid_mpc.workflow.stages.watch import WATCH
 
 STAGES: tuple[Stage[Any], ...] = (
-    DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, TASKS, CONTROL, LOOPS_ON_MODEL, ESTIMATION,
-    PROMISES, WATCH, ANALYSIS, REPORT,
+    DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, TRACK, NOISE, TASKS, CONTROL, LOOPS_ON_MODEL,
+    ESTIMATION, PROMISES, WATCH, ANALYSIS, REPORT,
 )  # fmt: skip
 """Stages in their order."""
 NAMES = tuple(stage.name for stage in STAGES)
 ALWAYS = (TASKS.name, REPORT.name)
 """Stages that run even if ``only`` does not name them: they only write what scenario and other stages hold."""
 SECONDS = {
-    "data": 2, "explain": 20, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "noise": 4,
+    "data": 2, "explain": 20, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "track": 30,
+    "noise": 4,
     "tasks": 1, "control": 42,
     "on_model": 14, "estimation": 1, "promises": 6, "watch": 36, "analysis": 1,
     "report": 9,
@@ -104,7 +106,7 @@ def run(
     took: dict[str, float] = {}
     without = (
         "on_model" if scenario.plant is not None else "control",
-        *(() if settings.explain else ("explain",)),
+        *(name for name, wanted in (("explain", settings.explain), ("track", settings.track)) if not wanted),
     )
     with open_folder(out, run_note(settings), resume=resume):
         for i, stage in enumerate(STAGES):

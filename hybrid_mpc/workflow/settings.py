@@ -40,6 +40,8 @@ class RunSettings:
             ``"mopgrnn"``. Default: the validation decides.
         explain: Whether to search for missing terms first; later stages then use the prior with the found terms.
             Default: False.
+        track: Whether to find the parameters that differ between recordings, for an observer that tracks them. Default:
+            False.
     """
 
     scenario: str
@@ -53,6 +55,7 @@ class RunSettings:
     device: str = "cpu"
     deploy: str = ""
     explain: bool = False
+    track: bool = False
 
     def network(self) -> dict[str, Any]:
         """Checked settings from the file, which replace those of the budget; empty without a file."""

@@ -35,6 +35,7 @@ from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, trained_models
+from hybrid_mpc.workflow.stages.track import TRACK
 
 FEW = 10
 """Samples of the comparison with torch for a network that shares another network's program; one of ten is extreme."""
@@ -176,13 +177,14 @@ def noise_stage(context: Context) -> NoiseResult | Absent:
 
 
 def put_noise(context: Context, found: NoiseResult) -> str:
-    """Write ``observer.json``: process noise, and the scenario's sensor noise and disturbance model."""
-    folder, scenario = context.out / "model", context.scenario
+    """Write ``observer.json``: process noise, tracked parameters, and the scenario's sensor noise and disturbances."""
+    folder, scenario, track = context.out / "model", context.scenario, context.find(TRACK)
+    tracked = () if isinstance(track, Absent) else track.tracking.tracked
     write_observer(
         folder,
         ObserverSettings(
             scenario.sensor_sigma, scenario.first_sigma, found.process_noise, found.disturbance_model,
-            found.of,
+            found.of, tracked,
         ),
     )  # fmt: skip
     return ""
@@ -221,8 +223,8 @@ EXPORT = Stage(
     (DATA, PRIOR, TRAINING, CHOICE), restore=artifact_is_there,
 )  # fmt: skip
 NOISE = Stage(
-    "noise", "tuning the observers", NoiseResult, noise_stage, observed, (DATA, PRIOR, EXPORT), optional=True,
-    restore=put_noise,
+    "noise", "tuning the observers", NoiseResult, noise_stage, observed, (DATA, PRIOR, EXPORT, TRACK),
+    optional=True, restore=put_noise,
 )  # fmt: skip
 TASKS = Stage(
     "tasks", "writing the control problems", TasksResult, tasks_stage,

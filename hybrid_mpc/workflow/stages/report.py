@@ -41,6 +41,7 @@ from hybrid_mpc.workflow.stages.identify import (
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
 from hybrid_mpc.workflow.stages.promises import PromisesResult
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect, write_results
+from hybrid_mpc.workflow.stages.track import TrackResult
 from hybrid_mpc.workflow.stages.watch import RATES, WatchedRecording, WatchResult
 from hybrid_mpc.workflow.stages.watching import watching_table
 
@@ -151,6 +152,8 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         tables["on_model"] = _on_model_tables(results.on_model)
     if not isinstance(results.estimation, Absent):
         tables["estimation"] = [_observer_table(results.estimation)]
+    if not isinstance(results.track, Absent):
+        tables["estimation"] = [*tables.get("estimation", ()), _varying_table(results.track)]
     if not isinstance(results.watch, Absent):
         tables["watch"] = _watch_tables(results.watch)
     if not isinstance(results.analysis, Absent):
@@ -573,6 +576,26 @@ def _observer_table(found: EstimationResult) -> Table:
     return Table(
         columns, rows, "Innovations on test recordings, without the first 25 samples of each recording."
     )
+
+
+def _varying_table(found: TrackResult) -> Table:
+    """Parameters by their variation between recordings."""
+    tracked = {one.name for one in found.tracking.tracked}
+    rows = [
+        (f"{p.name} [{p.unit}]", p.value, p.std or "fixed", p.gain,
+         "yes" if p.name in tracked else "no")
+        for p in found.varying.parameters
+    ]  # fmt: skip
+    of = "blocks of the recording" if found.varying.blocks else "recordings"
+    ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in found.tracking.ratio.items())
+    gain = (
+        f" Prediction errors over {found.tracking.horizon:g} s with tracking, over those without: {ratios}."
+    )
+    return Table(
+        ("parameter", "fitted", "standard deviation", "evidence", "tracked"), rows,
+        f"Variation of the parameters between {found.varying.pieces} {of}; evidence is the gain of log evidence over a "
+        f"fixed parameter.{gain if tracked else ' Tracking improves no prediction.'}",
+    )  # fmt: skip
 
 
 def _timing_table(ms: StepTimes) -> Table:

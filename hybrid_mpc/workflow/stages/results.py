@@ -30,12 +30,13 @@ from hybrid_mpc.workflow.stages.identify import (
 )
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, OnModelResult
 from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult
+from hybrid_mpc.workflow.stages.track import TRACK, TrackResult
 from hybrid_mpc.workflow.stages.watch import WATCH, WatchResult
 
 SCHEMA_VERSION = 12
 SHOWN: tuple[Stage[Any], ...] = (
-    DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION, PROMISES,
-    WATCH, ANALYSIS,
+    DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, TRACK, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION,
+    PROMISES, WATCH, ANALYSIS,
 )  # fmt: skip
 """Stages whose results the file and the report show: all but ``tasks``, which only writes files, and ``report``."""
 
@@ -57,6 +58,7 @@ class Results:
         choice: Recommended model.
         evaluation: Free runs on test data.
         export: Exported models compared with PyTorch.
+        track: Parameters that differ between recordings.
         noise: Process noise of the observers.
         control: Closed loops on the scenario's plant, and durations of steps.
         on_model: Closed loops of a scenario without plant.
@@ -78,6 +80,7 @@ class Results:
     choice: ChoiceResult
     evaluation: EvaluationResult
     export: ExportResult
+    track: TrackResult | Absent
     noise: NoiseResult | Absent
     control: ControlResult | Absent
     on_model: OnModelResult | Absent

@@ -1,0 +1,244 @@
+"""Predictions from an observer's state: horizons ahead, after it has watched a recording so far.
+
+A free run from a warm-up forgets what the observer has learned since: the state, disturbances, and tracked parameters.
+Here the observer runs along a recording, and from its estimate at each start the model predicts the horizon under the
+inputs and disturbances that were measured; unmeasured disturbances and tracked parameters are held.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.data.scales import evenly
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
+from hybrid_mpc.identify.varying import WORTH, Varying
+from hybrid_mpc.model.model import HybridModel
+
+Array = NDArray[np.float64]
+STARTS = 4
+"""Starts of predictions in a horizon."""
+BETTER = 0.97
+"""Ratio of errors from which on a further tracked parameter is worth its state."""
+HARM = 1.02
+"""Largest ratio of an output's error to that without tracking that counts as no harm."""
+WATCHED, RECORDINGS = 1500, 12
+"""Periods of a recording, and recordings, evenly chosen, at most over which observers are compared."""
+FAR = 1e6
+"""Largest error, over that of the untracked observer: what diverges counts as so much."""
+
+
+@dataclass(frozen=True)
+class AheadErrors:
+    """Errors of predictions from an observer's state.
+
+    Args:
+        rmse: Root mean square by recording and output ``(r, n_y)`` [output units], over starts and horizons.
+        starts: Number of predictions of each recording ``(r,)``.
+        names: Names of the recordings.
+    """
+
+    rmse: Array
+    starts: tuple[int, ...]
+    names: tuple[str, ...]
+
+    @property
+    def pooled(self) -> Array:
+        """Root mean square by output ``(n_y,)`` over all predictions."""
+        weights = np.array(self.starts, dtype=float)
+        return np.asarray(np.sqrt(weights @ np.square(self.rmse) / weights.sum()))
+
+
+def errors_ahead(
+    observer: Filter | TrackingFilter,
+    recordings: Sequence[Trajectory],
+    horizon: float,
+    *,
+    warm_up: float = 0.0,
+    every: int = 0,
+) -> AheadErrors:
+    """Errors of predictions over ``horizon`` from the observer's estimates along recordings.
+
+    Args:
+        observer: The observer; its model predicts.
+        recordings: Recordings on the model's grid, inputs as commanded. Those too short for a prediction are left out.
+        horizon: Length [s] of each prediction.
+        warm_up: Time [s] that the observer watches before the first prediction. Default: none.
+        every: Periods between two starts. Default: a quarter of the horizon.
+
+    Raises:
+        InputError: If no recording is long enough.
+
+    Example:
+        ``errors_ahead(kit.observer(), recordings, horizon=2.0, warm_up=1.0).pooled``
+    """
+    model = observer.model
+    periods, warm = max(1, round(horizon / model.dt)), round(warm_up / model.dt)
+    every = every or max(1, periods // STARTS)
+    found, starts, names = [], [], []
+    for t in recordings:
+        ks = list(range(max(warm, 1), len(t.t) - periods, every))
+        if ks:
+            found.append(_rmse(model, t, _watched(observer, t, ks), ks, periods))
+            starts.append(len(ks))
+            names.append(t.name)
+    if not found:
+        raise InputError(
+            f"predictions from the observer's state: no recording has {warm + periods + 1} samples, for a warm-up of "
+            f"{warm_up:g} s and a horizon of {horizon:g} s. Give longer recordings [HM-IDENTIFY-079]"
+        )
+    return AheadErrors(np.array(found), tuple(starts), tuple(names))
+
+
+def _watched(observer: Filter | TrackingFilter, t: Trajectory, ks: Sequence[int]) -> list[Estimate]:
+    """Estimates after the samples ``ks``."""
+    w = t.w if t.w.size else np.zeros((len(t.t), 0))
+    estimate, found = observer.start(t.y[0], w=w[0] if w.shape[1] else None), []
+    wanted = set(ks)
+    for k in range(1, ks[-1] + 1):
+        estimate = observer.update(estimate, t.y[k], t.u[k - 1], w=w[k] if w.shape[1] else None)
+        if k in wanted:
+            found.append(estimate)
+    return found
+
+
+def _rmse(
+    model: HybridModel, t: Trajectory, estimates: Sequence[Estimate], ks: Sequence[int], periods: int
+) -> Array:
+    """Root mean square errors ``(n_y,)`` of predictions from all starts side by side; infinite where one diverges."""
+    m, (on_u, on_x, on_y) = len(ks), model.disturbed
+    step, output = model.step.map(m), model.output.map(m)
+    x, h, d = (np.array([getattr(e, key) for e in estimates]).reshape(m, -1) for key in "xhd")
+    n_w = t.w.shape[1] if t.w.size else 0
+    held = np.array([e.w[n_w:] for e in estimates]).reshape(m, -1)  # tracked parameters
+    p, places = np.tile(model.p[:, None], m), np.array(ks)
+    z, hidden = x.T, h.T
+    squares = np.zeros(model.n_y)
+    counts = np.zeros(model.n_y)
+    for i in range(periods):
+        now, u = places + i, t.u[places + i] + d @ on_u.T
+        z, hidden = (v.full() for v in step(z, hidden, u.T, _with(t, now, n_w, held).T, p))
+        z = z + on_x @ d.T
+        shown = output(z, u.T, _with(t, now + 1, n_w, held).T, p).full().T + d @ on_y.T
+        error = t.y[now + 1] - shown
+        seen = np.isfinite(t.y[now + 1])
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares += np.where(seen, np.nan_to_num(np.square(error), nan=np.inf), 0.0).sum(axis=0)
+        counts += seen.sum(axis=0)
+    return np.asarray(np.sqrt(squares / np.maximum(counts, 1)))
+
+
+def _with(t: Trajectory, places: NDArray[np.intp], n_w: int, held: Array) -> Array:
+    """Disturbances ``(m, n_w + n_t)`` at samples, the tracked parameters held."""
+    return np.hstack([t.w[places] if n_w else np.zeros((len(places), 0)), held])
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """The parameters to track, and what tracking changes in predictions of the recordings that chose them.
+
+    Args:
+        tracked: The parameters; empty: none is worth it.
+        ratio: Error of predictions over that without tracking, by output [-]. Default: 1 each.
+        horizon: Length [s] of the predictions.
+        tried: Mean ratio of errors by the tried parameters, ``"a, b"``.
+    """
+
+    tracked: tuple[TrackedParameter, ...]
+    ratio: Mapping[str, float]
+    horizon: float
+    tried: Mapping[str, float]
+
+
+def choose_tracked(
+    watched: Sequence[Sequence[tuple[Filter, Sequence[Trajectory]]]],
+    varying: Varying,
+    horizon: float,
+    *,
+    warm_up: float = 0.0,
+) -> Tracking:
+    """Choose the parameters whose tracking improves predictions from the observer's state.
+
+    Candidates are the parameters whose own variation between recordings has evidence
+    (:func:`~hybrid_mpc.identify.varying.find_varying`). They enter one after the other, the best first, as long as the
+    error falls by 3 % and no output's rises by 2 %, in each set of evidence. All varying parameters together, and all
+    candidates together, are tried, too. A parameter that the user declares as varying is always tracked.
+
+    Two sets are needed, since either flatters. A prior that was fitted to the very recordings is closer to them than to
+    new ones, so tracking has less to gain. A prior that was fitted to fewer recordings is worse than the one that is
+    used, so tracking has more to gain.
+
+    Args:
+        watched: Sets of evidence. Each has observers without tracking, each with the recordings that it is judged by.
+            12 recordings of an observer at most count, and 1500 periods of each recording.
+        varying: Variation of the parameters.
+        horizon: Length [s] of the predictions.
+        warm_up: Time [s] that the observer watches before the first prediction. Default: none.
+    """
+    sets = [
+        [(o, [own[i].part(slice(WATCHED)) for i in evenly(len(own), RECORDINGS)]) for o, own in one]
+        for one in watched
+    ]
+    names = [s.name for s in watched[0][0][0].model.outputs]
+
+    def errors(
+        evidence: Sequence[tuple[Filter, Sequence[Trajectory]]], chosen: Sequence[TrackedParameter]
+    ) -> tuple[Array, Array]:
+        """Root mean squares of all recordings ``(r, n_y)``, and numbers of predictions ``(r,)``."""
+        found = [
+            errors_ahead(TrackingFilter(o, chosen) if chosen else o, own, horizon, warm_up=warm_up)
+            for o, own in evidence
+        ]
+        return np.concatenate([f.rmse for f in found]), np.concatenate([f.starts for f in found]).astype(
+            float
+        )
+
+    plain = [errors(one, ()) for one in sets]
+    floors = [np.maximum(rmse, 1e-12 * np.maximum(rmse.max(axis=0), 1e-300)) for rmse, _ in plain]
+    tried: dict[str, float] = {}
+
+    def judged(chosen: Sequence[TrackedParameter], needed: float = math.inf) -> tuple[float, Array]:
+        """Mean ratio of errors over recordings and outputs, and that of each output: the worst of the sets.
+
+        Sets behind one whose ratio is above ``needed`` are left out: they could not help.
+        """
+        outputs: list[Array] = []
+        for one, floor, (_, starts) in zip(sets, floors, plain, strict=True):
+            ratio = np.clip(errors(one, chosen)[0] / floor, 1.0 / FAR, FAR)
+            outputs.append(np.average(np.log(ratio), axis=0, weights=starts))
+            if math.exp(float(outputs[-1].mean())) > needed:
+                break
+        mean = math.exp(float(np.max([o.mean() for o in outputs])))
+        tried[", ".join(one.name for one in chosen)] = mean
+        return mean, np.exp(np.max(outputs, axis=0))
+
+    own = [p for p in varying.parameters if p.declared and p.varies]
+    best: tuple[TrackedParameter, ...] = tuple(p.tracked() for p in own)
+    ratio, outputs = judged(best) if best else (1.0, np.ones(len(names)))
+    pool = {
+        p.name: p.tracked(p.alone)
+        for p in varying.parameters
+        if not p.declared and p.alone > 0 and p.gain >= WORTH
+    }
+    varies = tuple(p.tracked() for p in varying.parameters if p.varies)
+    together = [varies, (*best, *pool.values())]
+    while True:
+        have = {one.name for one in best}
+        trials = [(*best, one) for name, one in pool.items() if name not in have]
+        trials += [one for one in together if len(one) > len(best) + 1]
+        together = []
+        found = [(*judged(trial, BETTER * ratio), trial) for trial in trials]
+        harmless = [one for one in found if (one[1] <= np.maximum(HARM, HARM * outputs)).all()]
+        first = min(harmless, key=lambda one: one[0], default=None)
+        if first is None or first[0] > BETTER * ratio:
+            break
+        ratio, outputs, best = first
+    return Tracking(best, dict(zip(names, outputs.tolist(), strict=True)), horizon, tried)

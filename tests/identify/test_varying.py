@@ -1,0 +1,182 @@
+"""Which parameters differ between recordings, and predictions from the observer's state with and without tracking."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import InputError, Parameter, Prior, Signal, fit_prior
+from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
+from hybrid_mpc.identify.ahead import choose_tracked, errors_ahead
+from hybrid_mpc.identify.prior_model import model_info, prior_programs
+from hybrid_mpc.identify.varying import find_varying
+from hybrid_mpc.kit.artifact import build_model
+
+DT, SIGMA = 0.1, 0.01
+
+
+class Heater(Prior):
+    """A heater with a sensor; ``cool`` acts with ``gain`` alone, so that the two are one."""
+
+    states = (Signal("heat", "K", -20.0, 20.0),)
+    inputs = (Signal("power", "W", -5.0, 5.0),)
+    outputs = states
+    parameters = (
+        Parameter("gain", 2.0, "K/W", 0.2, 10.0),
+        Parameter("tau", 1.0, "s", 0.1, 10.0),
+        Parameter("bias", 0.0, "W", -2.0, 2.0),
+    )
+
+    def xdot(self, x, u, w, p):
+        return ((p.gain * (u.power + p.bias) - x.heat) / p.tau,)
+
+
+class Twins(Heater):
+    """Two parameters of which only the product shows."""
+
+    parameters = (*Heater.parameters[:2], Parameter("share", 1.0, "-", 0.1, 10.0))
+
+    def xdot(self, x, u, w, p):
+        return ((p.gain * p.share * u.power - x.heat) / p.tau,)
+
+
+def recorded(gains, *, bias=0.0, seconds=40.0, seed=0):
+    """A recording for each gain, exactly integrated, with white noise."""
+    rng, found, n = np.random.default_rng(seed), [], round(seconds / DT)
+    for i, gain in enumerate(gains):
+        u = np.repeat(rng.uniform(-2.0, 2.0, n // 8 + 1), 8)[:n, None]
+        x, a = np.zeros((n, 1)), np.exp(-DT)
+        for k in range(n - 1):
+            x[k + 1] = a * x[k] + (1 - a) * gain * (u[k] + bias)
+        y, t = x + SIGMA * rng.standard_normal(x.shape), np.arange(n) * DT
+        nothing = np.full(x.shape, np.nan)
+        zeros = np.zeros(y.shape, dtype=np.int8)
+        found.append(Trajectory(f"day{i}", "train", DT, t, u, y, nothing, nothing, np.zeros((n, 0)), zeros))
+    return found
+
+
+def varying_of(make, recordings, length=4.0):
+    fit = fit_prior(make, recordings, [], dt=DT, length=length)
+    return fit, find_varying(make, fit, recordings, dt=DT, length=length)
+
+
+GAINS = 2.0 * np.exp(0.15 * np.random.default_rng(3).standard_normal(12))
+
+
+def test_the_spread_between_recordings_is_recovered():
+    _, found = varying_of(Heater, recorded(GAINS))
+    own = {p.name: p for p in found.parameters}
+    assert found.pieces == 12
+    assert not found.blocks
+    assert found.names == ("gain",)
+    assert own["gain"].relative
+    assert not own["bias"].relative
+    true = float(np.std(GAINS, ddof=1))
+    assert own["gain"].std == pytest.approx(true, rel=0.25)
+    assert own["gain"].gain > 20
+    assert own["tau"].std == own["bias"].std == 0.0
+
+
+def test_equal_recordings_have_fixed_parameters():
+    _, found = varying_of(Heater, recorded([2.0] * 6, seed=1))
+    assert found.names == ()
+
+
+def test_two_recordings_tell_a_large_difference_and_one_is_cut_into_blocks():
+    _, two = varying_of(Heater, recorded([1.6, 2.4]))
+    assert two.names == ("gain",)
+    assert two.pieces == 2
+    _, one = varying_of(Heater, recorded([2.0]))
+    assert one.blocks
+    assert one.pieces == 4
+    assert one.names == ()
+
+
+def test_a_parameter_that_is_not_identified_does_not_vary_beside_its_twin():
+    _, found = varying_of(Twins, recorded(GAINS))
+    assert len(found.names) == 1
+    assert found.names[0] in ("gain", "share")
+
+
+def test_the_user_decides():
+    class Declared(Heater):
+        parameters = (
+            Parameter("gain", 2.0, "K/W", 0.2, 10.0, varies=False),
+            Parameter("tau", 1.0, "s", 0.1, 10.0, varies=True),
+            Parameter("bias", 0.0, "W", -2.0, 2.0, varies=0.05),
+        )
+
+    _, found = varying_of(Declared, recorded([2.0] * 3))
+    own = {p.name: p for p in found.parameters}
+    assert own["gain"].std == 0.0
+    assert own["gain"].declared
+    assert own["bias"].std == pytest.approx(0.05)
+    assert own["tau"].std > 0
+    for wrong, code in ((0.0, "MACHINE-045"), (-1.0, "MACHINE-045"), (float("nan"), "RECORDS-012")):
+        with pytest.raises(InputError, match=code):
+            Parameter("k", 1.0, "-", 0.0, 2.0, varies=wrong)
+
+
+def test_recordings_that_are_too_short_are_refused():
+    recordings = recorded([2.0, 2.1])
+    fit = fit_prior(Heater, recordings, [], dt=DT, length=4.0)
+    short = [t.part(slice(20)) for t in recordings]
+    with pytest.raises(InputError, match="HM-IDENTIFY-078"):
+        find_varying(Heater, fit, short, dt=DT, length=4.0)
+
+
+def observer(fit):
+    prior = Heater(fit.values)
+    programs = {f"prior/{name}": p for name, p in prior_programs(prior, DT).items()}
+    model = build_model("prior", programs, model_info(prior, DT))
+    return ExtendedKalmanFilter(
+        model, sigma_y=[SIGMA], sigma_x=[0.005], sigma_x0=[0.1], sigma_d=[1e-3], sigma_d0=[1e-2]
+    )
+
+
+def test_predictions_from_the_observer_improve_where_a_parameter_varies():
+    fit, found = varying_of(Heater, recorded(GAINS))
+    chosen = choose_tracked([[(observer(fit), recorded(GAINS, seed=5))]], found, 2.0, warm_up=1.0)
+    assert chosen.tracked[0].name == "gain"
+    assert chosen.ratio["heat"] < 0.8
+    held = recorded([1.4, 2.8], seed=9)
+    plain = errors_ahead(observer(fit), held, 2.0, warm_up=10.0)
+    tracked = errors_ahead(TrackingFilter(observer(fit), chosen.tracked), held, 2.0, warm_up=10.0)
+    assert tracked.names == ("day0", "day1")
+    assert tracked.starts == plain.starts
+    assert (tracked.rmse < 0.4 * plain.rmse).all()
+
+
+def test_nothing_is_tracked_that_does_not_vary():
+    fit, found = varying_of(Heater, recorded([2.0] * 4))
+    chosen = choose_tracked([[(observer(fit), recorded([2.0] * 2, seed=5))]], found, 2.0)
+    assert chosen.tracked == ()
+    assert dict(chosen.ratio) == {"heat": 1.0}
+
+
+def test_a_prediction_needs_a_recording_longer_than_its_horizon():
+    fit, _ = varying_of(Heater, recorded([2.0] * 2))
+    with pytest.raises(InputError, match="HM-IDENTIFY-079"):
+        errors_ahead(observer(fit), recorded([2.0], seconds=10.0), 20.0)
+
+
+def test_errors_are_zero_for_the_exact_model_without_noise():
+    fit, _ = varying_of(Heater, recorded([2.0] * 2))
+    exact = observer(fit)
+    (t,) = recorded([2.0], seed=4)
+    x = t.y[:1]
+    clean = [x[0]]
+    for k in range(len(t.y) - 1):
+        x = exact.model.step(x.ravel(), [], t.u[k], [], exact.model.p)[0].full()
+        clean.append(x.ravel())
+    errors = errors_ahead(exact, [replace(t, y=np.array(clean))], 1.0)
+    assert errors.pooled[0] < 1e-9
+
+
+def test_tracked_entries_carry_the_scale():
+    _, found = varying_of(Heater, recorded(GAINS))
+    gain = found.parameters[0]
+    assert gain.tracked() == TrackedParameter("gain", gain.std / gain.value, True)
+    assert found.rows()[0]["varies"] is True

@@ -1,0 +1,80 @@
+"""A kit that names tracked parameters: its files, its observer and controller in a loop, and what has no C."""
+
+import json
+
+import numpy as np
+import pytest
+from test_kit_any_machine import DT, OCP, SCENARIO, Tanks
+
+import hybrid_mpc as hm
+from hybrid_mpc.embedded.export import write_controller
+from hybrid_mpc.estimate.tracking import DAY, TrackedParameter
+from hybrid_mpc.identify.prior_model import prior_programs
+from hybrid_mpc.kit.artifact import build_model
+from hybrid_mpc.kit.parts import loop_settings, save_loop
+
+TRACKED = (TrackedParameter("k", 0.2, relative=True),)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place, prior = tmp_path_factory.mktemp("tanks"), Tanks()
+    noise = dict.fromkeys(("prior", "prior_observer"), (1e-5, 1e-5))
+    hm.save_artifact(
+        place, {"prior": prior_programs(prior, DT)}, hm.model_info(prior, DT), loop=loop_settings(SCENARIO, noise),
+        recommended="prior",
+    )  # fmt: skip
+    return place
+
+
+@pytest.fixture(scope="module")
+def kit(folder):
+    own = hm.load(folder)
+    save_loop(folder, own.with_tracked(TRACKED).loop)
+    return hm.load(folder)
+
+
+def test_observer_json_names_the_tracked_parameters(folder, kit):
+    assert kit.loop.tracked == TRACKED
+    written = json.loads((folder / "observer.json").read_text(encoding="utf-8"))
+    assert written["tracked"] == [{"name": "k", "relative": True, "std": 0.2, "time": DAY}]
+    assert kit.on(SCENARIO).loop.tracked == TRACKED
+
+
+def test_promises_are_those_of_the_loop_without_tracking(kit):
+    assert kit.with_tracked(()).identity == kit.identity
+
+
+def test_a_kit_without_tracked_parameters_says_so(kit):
+    for ask in (
+        kit.with_tracked(()).tracking_observer,
+        lambda: kit.with_tracked(()).controller(tracking=True),
+    ):
+        with pytest.raises(hm.InputError, match="HM-KIT-040"):
+            ask()
+
+
+def test_a_tracking_loop_finds_the_outlet_and_has_no_offset(kit):
+    model = kit.models["prior"]
+    observer, controller = kit.tracking_observer(), kit.controller(tracking=True)
+    assert observer.model.n_w == controller.controller.model.n_w == 2
+    prior = Tanks({"k": 6.5e-4})
+    programs = {f"prior/{name}": p for name, p in prior_programs(prior, DT).items()}
+    plant = build_model("prior", programs, hm.model_info(prior, DT))
+    loop = hm.Loop(observer, controller, reference=[0.4])
+    x = model.x0
+    rng, heights = np.random.default_rng(0), []
+    u = loop.start(x[1:], w=[5e-5, np.nan])
+    for _ in range(200):
+        x = plant.step(x, [], u, [5e-5], plant.p)[0].full().ravel()
+        loop.finish()
+        u = loop.step(x[1:] + 1e-4 * rng.standard_normal(1), w=[5e-5, np.nan])
+        heights.append(x[1])
+    assert loop.estimate.w[1] == pytest.approx(6.5e-4, rel=0.1)
+    np.testing.assert_allclose(np.mean(heights[-20:]), 0.4, atol=2e-3)
+
+
+def test_c_refuses_an_observer_that_tracks(kit, tmp_path):
+    observer = kit.tracking_observer()
+    with pytest.raises(hm.InputError, match=r"TrackingFilter.*HM-EMBEDDED-011"):
+        write_controller(tmp_path / "c", observer.model, OCP, estimator=observer)
