@@ -67,7 +67,7 @@ def test_the_stage_finds_what_varies_and_is_then_up_to_date(files, tmp_path):
     assert "gain" in [one.name for one in found.tracking.tracked]
     assert found.tracking.ratio["heat"] < 0.97
     assert bring_up_to_date(context, TRACK) == "up to date"
-    rows = _varying_table(context).rows
+    rows = _varying_table(found).rows
     assert [row[0] for row in rows] == ["gain [K/W]", "tau [s]"]
     assert rows[0][-1] == "yes"
 
@@ -75,4 +75,3 @@ def test_the_stage_finds_what_varies_and_is_then_up_to_date(files, tmp_path):
 def test_without_the_option_nothing_is_searched(files, tmp_path):
     context = context_of(files, tmp_path, track=False)
     assert isinstance(context.find(TRACK), Absent)
-    assert _varying_table(context) is None
