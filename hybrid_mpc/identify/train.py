@@ -97,6 +97,8 @@ def train(
     total = settings.teacher_steps + settings.free_run_steps
     if checkpoint is not None and checkpoint.is_file():
         run.restore(*load_checkpoint(checkpoint, key))
+    if not total:  # untrained networks, which correct nothing
+        run.enter_stage()
     while not run.over:
         if run.done in (0, settings.teacher_steps):
             run.enter_stage()

@@ -67,7 +67,8 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     noise_known = scenario is not None or set(OBSERVERS) <= set(kit.loop.process_noise)
     if control is not None and not noise_known:
         notes.append(
-            "no closed loops: the model has no process noise for its observers; run the scenario again"
+            "no closed loops: the kit has no process noise for its observers. Give --scenario, or set it with "
+            "set_process_noise"
         )
     if control is not None and noise_known and {"prior", "hybrid"} <= set(kit.models):
         ocp = make_ocp(kit.models["prior"], control)

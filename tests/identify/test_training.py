@@ -39,6 +39,14 @@ def test_training_is_deterministic_and_the_seed_matters(data, whole):
     assert not np.array_equal(whole.weights["w_hh"], other.weights["w_hh"])
 
 
+@pytest.mark.parametrize("kind", ["pgrnn", "mopgrnn"])
+def test_without_steps_the_model_is_the_prior(data, kind):
+    untrained = train(PRIOR, *data, replace(SMALL, kind=kind, teacher_steps=0, free_run_steps=0))
+    assert np.isfinite(untrained.validation).all()
+    assert not untrained.weights["w_out"].any()
+    assert not untrained.weights["b_out"].any()
+
+
 RECORDED = {
     "rnn": ([1.2791536441755693, 1.4966904854425127], 3.5290088155354864, 0.4366571444961967),
     "pgrnn": ([0.30358809190488634, 0.2974081223462936], 1.61819340246503, -0.25068615876538997),
