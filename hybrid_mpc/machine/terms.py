@@ -865,7 +865,10 @@ def gain_by_direction(of: str, b: Parameter) -> Term:
 
 
 def input_curve(of: str, c: Parameter, *, centre: float, span: float) -> Term:
-    """A bent characteristic: ``u + c (u - centre) |u - centre| / span``; negative ``c`` saturates."""
+    """A bent characteristic: ``u + c (u - centre) |u - centre| / span``; negative ``c`` saturates.
+
+    It reverses where ``2 c |u - centre| < -span``: bound ``c`` by the input's range.
+    """
     return _added(
         "input_curve", "input curve", "input", of, (c,),
         lambda at, p: at.own + p[0] * (at.own - centre) * ca.fabs(at.own - centre) / span,
@@ -882,10 +885,22 @@ def saturation(of: str, k: Parameter) -> Term:
 
 
 def dead_zone(of: str, d: Parameter, *, width: float) -> Term:
-    """An input that must be this large before it acts: ``u - d tanh(u / width)``."""
+    """An input that must be this large before it acts, by
+    ``u - (sqrt((u + d)^2 + width^2) - sqrt((u - d)^2 + width^2)) / 2``: ``u - d`` far above ``d``, ``u + d`` far below
+    ``-d``.
+    """
+
+    def law(at: At, p: Any) -> Any:
+        # With s(z) = sqrt(z^2 + width^2), a smooth |z|, whose slope z / s(z) lies between -1 and 1, the law's slope is
+        # 1 - ((u + d) / s(u + d) - (u - d) / s(u - d)) / 2. For d >= 0 it lies above 0 and reaches at most 1, whatever
+        # d and width are: a controller never sees a reversed input. (u - d tanh(u / width) reverses where d > width.)
+        # At d = 0 both roots are equal: the law is u to the last digit, and its slope by d is a smooth sign of u.
+        above, below = (ca.sqrt((at.own + side * p[0]) ** 2 + width**2) for side in (1.0, -1.0))
+        return at.own - 0.5 * (above - below)
+
     return _added(
-        "dead_zone", "dead zone", "input", of, (d,), lambda at, p: at.own - p[0] * _sign(at.own, width),
-        f"{of} - {d.name} sign({of})", width=width,
+        "dead_zone", "dead zone", "input", of, (d,), law,
+        f"{of} - {d.name} sign({of}) where |{of}| > {d.name}, else 0 (smooth)", width=width,
     )  # fmt: skip
 
 
@@ -965,7 +980,10 @@ def output_offset(of: str, value: Parameter) -> Term:
 
 
 def output_curve(of: str, bend: Parameter, *, lower: float, upper: float) -> Term:
-    """A bent sensor that is right at two readings: ``y + bend (y - lower) (y - upper)``."""
+    """A bent sensor that is right at two readings: ``y + bend (y - lower) (y - upper)``.
+
+    It reverses where ``bend (2 y - lower - upper) < -1``: bound ``bend`` by the output's range.
+    """
     return _added(
         "output_curve", "sensor curve", "output", of, (bend,),
         lambda at, p: at.own + p[0] * (at.own - lower) * (at.own - upper),
