@@ -9,6 +9,7 @@ a prior may lack, with bounds from its recordings, says :func:`hybrid_mpc.identi
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -196,15 +197,18 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
     return made
 
 
-def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]:
+def with_nominal(
+    prior: type[Prior], values: Mapping[str, float], operating_point: OperatingPoint | None = None
+) -> type[Prior]:
     """A prior class with other nominal parameters, e.g. fitted ones; of an extended prior those of its terms, too.
 
     Args:
         prior: A prior; an extended one too.
         values: Nominal values [their units] by name. Parameters that are not named keep theirs.
+        operating_point: The equilibrium with these values, states of terms included. Default: the prior's.
 
     Raises:
-        InputError: If a name is no parameter.
+        InputError: If a name is no parameter, or a value lies outside the prior's bounds.
 
     Example:
         >>> class Decay(Prior):
@@ -224,11 +228,34 @@ def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]
     own: Any = prior
     terms: tuple[Term, ...] = getattr(own, "terms", ())
     base: Any = getattr(own, "base", own)
+    refuse(list(_beyond(base, values)))
     chosen = tuple(replace(p, value=values.get(p.name, p.value)) for p in base.parameters)
-    made = type(
-        base.__name__, (base,), {"parameters": chosen, "__module__": base.__module__, "__doc__": base.__doc__}
+    changed = {"parameters": chosen, "__module__": base.__module__, "__doc__": base.__doc__}
+    point = operating_point or prior.operating_point
+    if point is not None:
+        changed["operating_point"] = replace(point, x=point.x[: len(base.states)])
+    made: Any = extended(
+        type(base.__name__, (base,), changed), *(_with_values(term, values) for term in terms)
     )
-    return extended(made, *(_with_values(term, values) for term in terms))
+    made.operating_point = point
+    chosen_prior: type[Prior] = made
+    return chosen_prior
+
+
+def _beyond(base: Any, values: Mapping[str, float]) -> Iterator[str]:
+    """Values outside the bounds of the class that declares the parameters."""
+    file = getattr(sys.modules.get(base.__module__), "__file__", None)
+    where = f"class {base.__name__}" + (f" in {file}" if file else "")
+    for p in base.parameters:
+        value = values.get(p.name, p.value)
+        if not p.lower <= value <= p.upper:
+            what = "fixes it" if p.fixed else "bounds it"
+            yield (
+                f"with_nominal: {p.name} = {value:g} {p.unit} lies outside [{p.lower:g}, {p.upper:g}]: {where} {what}. "
+                f"Leave {p.name} out of the values to keep {p.value:g} (in a file of hybrid-mpc explain: delete its "
+                f"line of FITTED), widen its bounds there, or run hybrid-mpc explain again with the new bounds "
+                "[HM-MACHINE-045]"
+            )
 
 
 def _with_values(term: Term, values: Mapping[str, float]) -> Term:

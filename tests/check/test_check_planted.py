@@ -250,7 +250,7 @@ PLANTED = {
         kettle(operating_point=OperatingPoint((0.25, 20.0), (0.15, 0.0), (20.0,))),
         [
             "operating_point is not an equilibrium", "level changes by 0.025 m per second",
-            "holds: x = [", "HM-CHECK-015",
+            "x = [", "u = [0.1, ", "HM-CHECK-015",
         ],
     ),
     "an operating point beyond a range": (

@@ -211,6 +211,45 @@ def test_a_found_state_leaves_the_control_problem_to_the_user(machine, explained
     check_scenario(scenario)
 
 
+def test_the_written_operating_point_is_an_equilibrium_with_the_found_terms(machine, explained, tmp_path):
+    """An offset of the torque moves the equilibrium; a parameter that is fixed later in the base file says so."""
+    _, found = explained
+    told, path = found.explanation, tmp_path / "base.py"
+    path.write_text((machine / "my_machine.py").read_text())
+    shift = terms.input_offset("tau", hm.Parameter("o_tau", 0.0, "N m", -1.0, 1.0))
+    term = replace(told.found[0], name=shift.name, made=shift.made)
+    value = replace(told.parameters[-1], name="o_tau", value=0.3, lower=-1.0, upper=1.0)
+    changed = replace(
+        told, steps=(replace(told.steps[0], terms=(term,)),), parameters=(*told.parameters[:-1], value)
+    )
+    file = tmp_path / "shifted.py"
+    file.write_text(scenario_code(load_scenario(str(path)), str(path), changed, tmp_path))
+    scenario = load_scenario(str(file))
+    old = type(load_scenario(str(path)).prior()).operating_point
+    point = scenario.prior().operating_point
+    assert point.x == old.x
+    assert point.u[0] == pytest.approx(old.u[0] - 0.3)
+    check_scenario(scenario)
+    fixed = next(p for p in scenario.prior().parameters if p.name != "o_tau" and p.value != p.lower)
+    kind = "class Fixed"
+    path.write_text(
+        path.read_text()
+        + f"""
+class Fixed(type(scenario.prior())):
+    parameters = tuple(
+        dataclasses.replace(p, value=p.lower, upper=p.lower) if p.name == {fixed.name!r} else p
+        for p in type(scenario.prior()).parameters
+    )
+scenario = dataclasses.replace(scenario, prior=Fixed)
+"""
+    )
+    with pytest.raises(InputError) as refused:
+        load_scenario(str(file))
+    assert "HM-MACHINE-045" in str(refused.value)
+    assert kind in str(refused.value)
+    assert str(path) in str(refused.value)
+
+
 def test_bars_without_a_finite_error_are_refused():
     assert error_steps(["a", "b", "c"], [1.0, float("inf"), 0.5], "error [-]").axes
     with pytest.raises(InputError):
