@@ -809,12 +809,26 @@ def loss(of: str, k: Parameter, n: Parameter, *, scale: float, reference: str | 
 
 
 def radiation(of: str, k: Parameter, *, kelvin: float, surroundings: float) -> Term:
-    """Radiation ``-k ((x + kelvin)^4 - (surroundings + kelvin)^4) / 1e8``; ``kelvin`` is 273.15 for degC, 0 for K."""
+    """Radiation ``-k ((x + kelvin)^4 - (surroundings + kelvin)^4) / 1e8``; ``kelvin`` is 273.15 for degC, 0 for K.
+
+    Its formula is written in kelvin.
+    """
     return _added(
         "radiation", "radiation", "rate", of, (k,),
         lambda at, p: -p[0] * ((at.own + kelvin) ** 4 - (surroundings + kelvin) ** 4) / 1e8,
-        f"-{k.name} (T^4 - {surroundings:.3g}^4)", kelvin=kelvin, surroundings=surroundings,
+        f"-{k.name} ({_kelvin(of, kelvin)}^4 - {surroundings + kelvin:.5g}^4) / 1e8",
+        kelvin=kelvin, surroundings=surroundings,
     )  # fmt: skip
+
+
+def _kelvin(of: str, kelvin: float) -> str:
+    """A temperature in kelvin, as text.
+
+    Example:
+        >>> _kelvin("T", 273.15), _kelvin("T", 0.0)
+        ('(T + 273.15)', 'T')
+    """
+    return of if kelvin == 0.0 else f"({of} + {kelvin:g})"
 
 
 def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:

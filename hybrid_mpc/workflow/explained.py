@@ -93,8 +93,9 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Pa
     lines = [
         f'"""{_plain(scenario.title)}: the prior with the terms that the recordings support.',
         "",
-        f"Written by hybrid-mpc explain. Judged by {found.evidence.text}: the held-out error is",
-        f"{found.after.ratio:.2f} of the fitted prior's. You may edit this file.",
+        f"Written by hybrid-mpc explain, evaluated on {found.evidence.text}.",
+        f"Held-out error with the terms over that without: {found.after.ratio:.2f} ({found.averaged}).",
+        "You may edit this file.",
         '"""',
         "",
         "from dataclasses import replace",

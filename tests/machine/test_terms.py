@@ -170,6 +170,17 @@ def test_terms_of_processes_add_to_rates_and_balances():
     assert float(volume.supply(x, u, w, made.p)) == pytest.approx(0.2 + 0.1 * 10.0)
 
 
+@pytest.mark.parametrize(
+    ("kelvin", "text"), [(273.15, "(heat + 273.15)^4 - 292.25^4"), (0.0, "heat^4 - 19.1^4")]
+)
+def test_the_formula_of_radiation_is_in_kelvin_and_has_its_value(kelvin, text):
+    radiation = terms.radiation("heat", p("e", 0.02, "degC/s 1e8/K^4"), kelvin=kelvin, surroundings=19.1)
+    assert text in radiation.text
+    rate = extended(Tank, radiation)().equations.xdot([1.0, 80.0], [0.1], [20.0], [0.1, 0.02])[1]
+    value = eval(radiation.text.replace("-e", "-0.02 *").replace("^", "**"), {"heat": 80.0})
+    assert float(rate) == pytest.approx(0.01 * (20.0 - 80.0) + value, rel=1e-6)
+
+
 def test_an_own_term_takes_a_few_lines():
     leak = Term("leak", "rate", "level", (p("leak", 0.25, "1/s"),), lambda at, p: -p.leak * at.own, loss=True)
     made = extended(Tank, leak)()

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from machine_runs import recording, write
 import hybrid_mpc as hm
 from hybrid_mpc import InputError, RunSettings, extended, load_scenario, terms, with_nominal
 from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.identify.explain import WORTH
 from hybrid_mpc.plots.explain import error_steps
-from hybrid_mpc.workflow import explain_search
+from hybrid_mpc.workflow import explain_page, explain_search
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain import read_result
 from hybrid_mpc.workflow.explain_search import chosen_terms
@@ -62,6 +65,24 @@ def test_its_page_shows_the_steps_and_the_term(explained):
         assert words in page
     assert {p.name for p in (out / "figures").iterdir()} == {"error_by_step.png", "step_1_1.png"}
     assert page.count("data:image/png") == 2
+
+
+def test_ratios_are_one_statistic_with_one_name(explained, machine):
+    """Page, table and file say of what the ratio is the mean; the bars show errors alone, without a ratio."""
+    out, found = explained
+    told, words = found.explanation, found.explanation.averaged
+    assert str(told.evidence.pieces) in words
+    page = (out / "explain.html").read_text()
+    assert words in page
+    assert words in explain_page.steps_table(told).caption
+    assert explain_page.RATIO in explain_page.steps_table(told).columns
+    assert words in " ".join(summary(found, out))
+    assert words in (out / found.file).read_text()
+    figure = error_steps(*explain_page.bars_of(told), "error [-]")
+    assert not any("%" in text.get_text() for text in figure.axes[0].texts)
+    rule = f"below {WORTH:g} and the upper end of its interval is below 1"
+    assert rule in page
+    assert rule in (Path(__file__).parents[2] / "docs/explain.md").read_text()
 
 
 def test_its_scenario_has_the_prior_of_the_explanation(explained, machine, files, call):
