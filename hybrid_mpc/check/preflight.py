@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.check.default_tasks import default_tasks
-from hybrid_mpc.check.prior import DRIFT, Report, check_prior
+from hybrid_mpc.check.operating_point import both_ways, drift_at_rest, sizes_of
+from hybrid_mpc.check.prior import Report, check_prior
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.data.excitation import check_excitation, short_runs
@@ -169,12 +170,6 @@ def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
     return ()
 
 
-def _sizes(signals: tuple[Signal, ...], at: Array) -> Array:
-    """Size of each signal: its range, else its value, at least 1."""
-    ranges = np.array([s.upper - s.lower for s in signals], dtype=np.float64)
-    return np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(at), 1.0))
-
-
 def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest | None, HybridModel | None]:
     """The prior at its operating point, with speed and observability; and the prior as a deployed model."""
     from hybrid_mpc.identify.fit import check_observable
@@ -210,28 +205,11 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
 def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
     """Check that the operating point is an equilibrium."""
     if moving := drift_at_rest(prior, second):
-        x, u, w = rest_of(prior)
+        x, u, _ = rest_of(prior)
         report.add(
-            f"prior: operating_point is not an equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}. Give the "
-            f"input that holds these states, or the states that this input holds{_nearest(prior, x, u, w)} "
-            "[HM-CHECK-015]"
+            f"prior: operating_point is not an equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}. "
+            f"{both_ways(prior)}. Write one of them into operating_point [HM-CHECK-015]"
         )
-
-
-def drift_at_rest(prior: Prior, second: float) -> str:
-    """The states that move at the operating point, as text; empty if none moves, or no point is given.
-
-    ``second`` is the time [s] within which a state may drift by a hundredth of its size.
-    """
-    if prior.operating_point is None:
-        return ""
-    x, u, w = rest_of(prior)
-    rates = prior.equations.xdot(x, u, w, prior.p).full().ravel()
-    return ", ".join(
-        f"{s.name} changes by {r:.3g} {s.unit} per second"
-        for s, r, size in zip(prior.states, rates, _sizes(prior.states, x), strict=True)
-        if abs(r) * second > DRIFT * size
-    )
 
 
 def warn_of_drift(prior: Prior, second: float) -> tuple[str, ...]:
@@ -241,18 +219,9 @@ def warn_of_drift(prior: Prior, second: float) -> tuple[str, ...]:
         return ()
     return (
         f"operating_point is not an equilibrium with the fitted parameters ({moving}), but observers start there. "
-        "Write the fitted values into the prior's parameters, and their steady state into operating_point"
-        f"{_nearest(prior, *rest_of(prior))}",
+        "Write the fitted values into the prior's parameters, and their steady state into operating_point. "
+        f"{both_ways(prior)}",
     )
-
-
-def _nearest(prior: Prior, x: Array, u: Array, w: Array) -> str:
-    """The equilibrium that Newton's method finds from a point, as text to copy; empty if it finds none."""
-    n_x, scale = len(x), np.concatenate([_sizes(prior.states, x), np.ones(len(u))])
-    equations, near = RateEquations(prior.equations.xdot, w, prior.p), np.concatenate([x, u])
-    found = rate_search(equations, scale, near, np.zeros(n_x), free=np.arange(n_x)).descend(near, x)
-    inside = all(s.lower <= v <= s.upper for s, v in zip(prior.states, found.v[:n_x], strict=True))
-    return f": x = {[float(f'{v:.6g}') for v in found.v[:n_x]]}" if found.steady and inside else ""
 
 
 def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[Equilibrium, ...]:
@@ -470,7 +439,7 @@ def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) 
     steps = np.where(np.isfinite(ranges), 0.1 * ranges, 1.0)
     room = np.array([s.upper for s in model.inputs]) - rest.u
     steps = np.where(room >= steps, steps, -steps)
-    sizes = _sizes(model.states, rest.x)
+    sizes = sizes_of(model.states, rest.x)
     step: Any = plant.step
     held = (rest.w,) if len(rest.w) else ()
 
@@ -570,7 +539,7 @@ def _check_set_point(
     tied = weights > 0
     if np.ptp(last, axis=0)[tied].any() or not tied.any():
         return
-    target, sizes, wanted = last[-1], _sizes(prior.states, rest.x), _sizes(signals, last[-1])
+    target, sizes, wanted = last[-1], sizes_of(prior.states, rest.x), sizes_of(signals, last[-1])
     first = np.concatenate([rest.x, np.clip(rest.u, control.u_min, control.u_max)])
     if not by_output:
         sizes, first[:n_x] = wanted, np.where(tied, target, rest.x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,8 +71,9 @@ def check(
     _tell(console, found, context.spec)
     problems, warnings = found.problems, (*found.warnings, *found.doubts)
     in_doubt: tuple[str, ...] = ()
+    lacking: tuple[str, ...] = ()
     if fit and not problems:
-        problems, found_warnings, in_doubt = _fit(console, context)
+        problems, found_warnings, in_doubt, lacking = _fit(console, context)
         warnings += found_warnings
     left = left_to_decide(Path(scenario)) if scenario.endswith(".py") else []
     for texts, style, title in (
@@ -86,12 +88,20 @@ def check(
         raise typer.Exit(WRONG)
     if in_doubt:
         console.print("\nCorrect the prior before a run; docs/prior-wrong.md explains each doubt.")
+        if lacking:
+            words = ["hybrid-mpc", "explain", *scenario, *settings.options(str)]
+            console.print(
+                f"A physical term may be missing: '{shlex.join(words)}' searches for it (docs/explain.md).",
+                markup=False, soft_wrap=True,
+            )  # fmt: skip
         return
     console.print("\nNo errors; continue with 'hybrid-mpc run'." if data or fit else "\nNo errors.")
 
 
-def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Fit the prior and print the results; return errors, warnings, and doubts about the structure."""
+def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], ...]:
+    """Fit the prior and print the results; return errors, warnings, doubts about the structure, and those of them that
+    a missing term can explain.
+    """
     from dataclasses import replace
 
     from hybrid_mpc.cli.progress import Unwarned, make_progress
@@ -103,11 +113,11 @@ def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str
         try:
             found = fit_of(replace(context, progress=Unwarned(progress)))
         except InputError as error:
-            return error.problems, (), ()
+            return error.problems, (), (), ()
     prior = context.scenario.prior()
     console.print(_fitted_parameters(prior, found))
     console.print(_free_runs(prior, found))
-    return stops(found, cause=False), found.fit.warnings, found.in_doubt
+    return stops(found, cause=False), found.fit.warnings, found.in_doubt, found.lacking
 
 
 def _fitted_parameters(prior: Prior, found: PriorResult) -> Table:

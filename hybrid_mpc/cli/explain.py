@@ -68,6 +68,8 @@ def summary(found: ExplainResult, folder: Path) -> list[str]:
     """The result in a few lines."""
     explanation = found.explanation
     lines = [f"evaluated on {explanation.evidence.text}, in free runs of {explanation.evidence.length:.3g} s"]
+    if explanation.steps:
+        lines.append(f"errors: all samples together; ratios: {explanation.averaged}")
     if not explanation.found:
         return [*lines, f"no term was added: {explanation.reason}"]
     lines += [f"found: {term.name}: {term.formula}" for term in explanation.found]
@@ -80,12 +82,10 @@ def summary(found: ExplainResult, folder: Path) -> list[str]:
 
 def _steps(found: ExplainResult) -> Table:
     """One row per step."""
-    from hybrid_mpc.workflow.explain_page import alternatives_of, interval, signed, values_of
+    from hybrid_mpc.workflow.explain_page import RATIO, alternatives_of, interval, signed, values_of
 
     explanation = found.explanation
-    table = _table(
-        "steps", "step", "held-out error [-]", "ratio to the previous step", "fitted values", "alternatives"
-    )
+    table = _table("steps", "step", "held-out error [-]", RATIO, "fitted values", "alternatives")
     table.add_row("prior, nominal", f"{explanation.nominal:.3g}", "", "", "")
     table.add_row("prior, fitted", f"{explanation.before:.3g}", "", "", "")
     for step in explanation.steps:

@@ -798,12 +798,13 @@ class _Explain:
         if not np.isfinite(squares).all():
             return _Fitted(forms, None, theta, squares, "its free runs diverge")
         if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
-            reason = f"the error is {found.ratio:.2f} of that without it"
+            less = "" if found.ratio >= WORTH else ", but the error over all samples is not smaller"
+            reason = f"the ratio to the model without it is {found.ratio:.2f}{less}"
         elif found.upper >= 1.0:
             more = self.evidence.needed(squares, self.now.squares, candidates)
-            reason = f"the error is {found.ratio:.2f} of that without it ({bound(found.upper)}): not sure"
+            reason = f"the ratio to the model without it is {found.ratio:.2f} ({bound(found.upper)}): not significant"
             if more:
-                reason += f", {more} more recording{'s' * (more > 1)} like these would tell"
+                reason += f", {more} more recording{'s' * (more > 1)} like these would show it"
         elif found.error > POOR and found.ratio > GAIN:
             reason = f"the error is {found.error:.2f} of the outputs' spread with it: so small a gain may be chance"
         elif untold:
@@ -845,7 +846,7 @@ class _Explain:
         elif chosen is not None and one.held_out.ratio < WORTH:
             between = self.evidence.compared(one.squares, chosen.squares, 1)
             outcome = "alternative" if between.lower <= 1.0 else "worse"
-            reason = f"the error is {between.ratio:.2f} of that with {chosen.forms[0].name}"
+            reason = f"the ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
         elif one.held_out.ratio < WORTH:
             outcome = "unsure"
         return Trial(tuple(_found(form) for form in one.forms), outcome, one.held_out, reason)

@@ -227,6 +227,16 @@ class Explanation:
     reason: str
 
     @property
+    def averaged(self) -> str:
+        """What a ratio of errors is the mean of, in words: each piece of evidence counts the same.
+
+        The errors themselves weigh all samples together, so the ratio of two errors is another number.
+        """
+        own = self.evidence
+        pieces = "recordings" if own.pieces == own.recordings else "blocks"
+        return f"geometric mean of the ratios of {own.pieces} {pieces}"
+
+    @property
     def found(self) -> tuple[FoundTerm, ...]:
         """The terms that remain, in the order in which they were added."""
         there: dict[str, FoundTerm] = {}
@@ -288,10 +298,10 @@ def _named(terms: Sequence[FoundTerm]) -> str:
 
 
 def bound(upper: float) -> str:
-    """Text of an upper bound.
+    """Text of the upper end of an interval.
 
     Example:
         >>> bound(0.912), bound(math.inf)
-        ('at most 0.91', 'without a bound')
+        ('upper end 0.91', 'no upper end')
     """
-    return f"at most {upper:.2f}" if math.isfinite(upper) and upper < 1e6 else "without a bound"
+    return f"upper end {upper:.2f}" if math.isfinite(upper) and upper < 1e6 else "no upper end"

@@ -5,6 +5,7 @@ The structure and units of a prior, not its names, determine which terms apply.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,10 @@ WIDEST, NARROWEST = 0.05, 0.005
 the change of the speed in a period: the recordings do not resolve less, and the integration needs no shorter steps."""
 EXPONENTS = 0.25, 4.0
 """Bounds of the exponent of a loss; an outlet has 0.5, radiation 4."""
+STEEP = 0.9
+"""Largest relative change of slope by a curve at the ends of its signal: the curve never reverses there."""
+MARGIN = 0.5
+"""How far beyond the recordings no curve of a signal without bounds may reverse, over the range of the recordings."""
 REACH = 3.0
 """Bound of a term's weight: largest effect of the term, over the state's rate in the recordings."""
 
@@ -368,14 +373,12 @@ class _Library:
             "saturation of the input",
         )
         yield _one(laws.saturation(own, k))
-        yield _one(
-            laws.input_curve(
-                own,
-                of("g_c", 0.5, words="bend of the input"),
-                centre=centre if centre > 2 * spread else 0.0,
-                span=2 * spread,
-            )
-        )
+        middle, span = (centre if centre > 2 * spread else 0.0), 2 * spread
+        # slope of the curve: 1 + 2 c |u - middle| / span
+        farthest = max(abs(end - middle) for end in _ends(signal, values))
+        least = -min(0.5, 0.5 * STEEP * span / farthest)
+        bend = Parameter(f"g_c_{own}", 0.0, "-", least, 0.5, "bend of the input")
+        yield _one(laws.input_curve(own, bend, centre=middle, span=span))
 
     def _output(self, i: int, signal: Signal) -> Iterator[Candidate]:
         y = self.prior.equations.output(self.x.T, self.u.T, self.w.T, self.prior.p).full()[i]
@@ -393,12 +396,24 @@ class _Library:
         yield _one(laws.output_gain(own, of("s_g", 0.5, words="relative error of the sensor's gain")))
         yield _one(laws.output_offset(own, of("s_o", 2 * spread, unit, "offset of the sensor")))
         low, high = (float(v) for v in np.quantile(y, (0.0, 1.0)))
-        bend = of("s_b", 0.9 / (high - low), over("1", unit), "bend of the sensor")
+        # slope of the curve: 1 + bend (2 y - low - high)
+        farthest = max(abs(2 * end - low - high) for end in _ends(signal, y))
+        bend = of("s_b", STEEP / farthest, over("1", unit), "bend of the sensor")
         yield _one(laws.output_curve(own, bend, lower=low, upper=high))
 
 
 def _one(term: Term) -> Candidate:
     return Candidate(term.name, (term,))
+
+
+def _ends(signal: Signal, values: Array) -> tuple[float, float]:
+    """Range in which a curve must not reverse: the signal's bounds, else the recordings and a margin."""
+    low, high = float(values.min()), float(values.max())
+    more = MARGIN * (high - low)
+    return (
+        min(low, signal.lower) if math.isfinite(signal.lower) else low - more,
+        max(high, signal.upper) if math.isfinite(signal.upper) else high + more,
+    )
 
 
 def _short(name: str) -> str:

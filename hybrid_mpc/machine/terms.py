@@ -9,6 +9,7 @@ a prior may lack, with bounds from its recordings, says :func:`hybrid_mpc.identi
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -196,15 +197,18 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
     return made
 
 
-def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]:
+def with_nominal(
+    prior: type[Prior], values: Mapping[str, float], operating_point: OperatingPoint | None = None
+) -> type[Prior]:
     """A prior class with other nominal parameters, e.g. fitted ones; of an extended prior those of its terms, too.
 
     Args:
         prior: A prior; an extended one too.
         values: Nominal values [their units] by name. Parameters that are not named keep theirs.
+        operating_point: The equilibrium with these values, states of terms included. Default: the prior's.
 
     Raises:
-        InputError: If a name is no parameter.
+        InputError: If a name is no parameter, or a value lies outside the prior's bounds.
 
     Example:
         >>> class Decay(Prior):
@@ -224,11 +228,34 @@ def with_nominal(prior: type[Prior], values: Mapping[str, float]) -> type[Prior]
     own: Any = prior
     terms: tuple[Term, ...] = getattr(own, "terms", ())
     base: Any = getattr(own, "base", own)
+    refuse(list(_beyond(base, values)))
     chosen = tuple(replace(p, value=values.get(p.name, p.value)) for p in base.parameters)
-    made = type(
-        base.__name__, (base,), {"parameters": chosen, "__module__": base.__module__, "__doc__": base.__doc__}
+    changed = {"parameters": chosen, "__module__": base.__module__, "__doc__": base.__doc__}
+    point = operating_point or prior.operating_point
+    if point is not None:
+        changed["operating_point"] = replace(point, x=point.x[: len(base.states)])
+    made: Any = extended(
+        type(base.__name__, (base,), changed), *(_with_values(term, values) for term in terms)
     )
-    return extended(made, *(_with_values(term, values) for term in terms))
+    made.operating_point = point
+    chosen_prior: type[Prior] = made
+    return chosen_prior
+
+
+def _beyond(base: Any, values: Mapping[str, float]) -> Iterator[str]:
+    """Values outside the bounds of the class that declares the parameters."""
+    file = getattr(sys.modules.get(base.__module__), "__file__", None)
+    where = f"class {base.__name__}" + (f" in {file}" if file else "")
+    for p in base.parameters:
+        value = values.get(p.name, p.value)
+        if not p.lower <= value <= p.upper:
+            what = "fixes it" if p.fixed else "bounds it"
+            yield (
+                f"with_nominal: {p.name} = {value:g} {p.unit} lies outside [{p.lower:g}, {p.upper:g}]: {where} {what}. "
+                f"Leave {p.name} out of the values to keep {p.value:g} (in a file of hybrid-mpc explain: delete its "
+                f"line of FITTED), widen its bounds there, or run hybrid-mpc explain again with the new bounds "
+                "[HM-MACHINE-045]"
+            )
 
 
 def _with_values(term: Term, values: Mapping[str, float]) -> Term:
@@ -782,12 +809,26 @@ def loss(of: str, k: Parameter, n: Parameter, *, scale: float, reference: str | 
 
 
 def radiation(of: str, k: Parameter, *, kelvin: float, surroundings: float) -> Term:
-    """Radiation ``-k ((x + kelvin)^4 - (surroundings + kelvin)^4) / 1e8``; ``kelvin`` is 273.15 for degC, 0 for K."""
+    """Radiation ``-k ((x + kelvin)^4 - (surroundings + kelvin)^4) / 1e8``; ``kelvin`` is 273.15 for degC, 0 for K.
+
+    Its formula is written in kelvin.
+    """
     return _added(
         "radiation", "radiation", "rate", of, (k,),
         lambda at, p: -p[0] * ((at.own + kelvin) ** 4 - (surroundings + kelvin) ** 4) / 1e8,
-        f"-{k.name} (T^4 - {surroundings:.3g}^4)", kelvin=kelvin, surroundings=surroundings,
+        f"-{k.name} ({_kelvin(of, kelvin)}^4 - {surroundings + kelvin:.5g}^4) / 1e8",
+        kelvin=kelvin, surroundings=surroundings,
     )  # fmt: skip
+
+
+def _kelvin(of: str, kelvin: float) -> str:
+    """A temperature in kelvin, as text.
+
+    Example:
+        >>> _kelvin("T", 273.15), _kelvin("T", 0.0)
+        ('(T + 273.15)', 'T')
+    """
+    return of if kelvin == 0.0 else f"({of} + {kelvin:g})"
 
 
 def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:
@@ -865,7 +906,10 @@ def gain_by_direction(of: str, b: Parameter) -> Term:
 
 
 def input_curve(of: str, c: Parameter, *, centre: float, span: float) -> Term:
-    """A bent characteristic: ``u + c (u - centre) |u - centre| / span``; negative ``c`` saturates."""
+    """A bent characteristic: ``u + c (u - centre) |u - centre| / span``; negative ``c`` saturates.
+
+    It reverses where ``2 c |u - centre| < -span``: bound ``c`` by the input's range.
+    """
     return _added(
         "input_curve", "input curve", "input", of, (c,),
         lambda at, p: at.own + p[0] * (at.own - centre) * ca.fabs(at.own - centre) / span,
@@ -882,10 +926,22 @@ def saturation(of: str, k: Parameter) -> Term:
 
 
 def dead_zone(of: str, d: Parameter, *, width: float) -> Term:
-    """An input that must be this large before it acts: ``u - d tanh(u / width)``."""
+    """An input that must be this large before it acts, by
+    ``u - (sqrt((u + d)^2 + width^2) - sqrt((u - d)^2 + width^2)) / 2``: ``u - d`` far above ``d``, ``u + d`` far below
+    ``-d``.
+    """
+
+    def law(at: At, p: Any) -> Any:
+        # With s(z) = sqrt(z^2 + width^2), a smooth |z|, whose slope z / s(z) lies between -1 and 1, the law's slope is
+        # 1 - ((u + d) / s(u + d) - (u - d) / s(u - d)) / 2. For d >= 0 it lies above 0 and reaches at most 1, whatever
+        # d and width are: a controller never sees a reversed input. (u - d tanh(u / width) reverses where d > width.)
+        # At d = 0 both roots are equal: the law is u to the last digit, and its slope by d is a smooth sign of u.
+        above, below = (ca.sqrt((at.own + side * p[0]) ** 2 + width**2) for side in (1.0, -1.0))
+        return at.own - 0.5 * (above - below)
+
     return _added(
-        "dead_zone", "dead zone", "input", of, (d,), lambda at, p: at.own - p[0] * _sign(at.own, width),
-        f"{of} - {d.name} sign({of})", width=width,
+        "dead_zone", "dead zone", "input", of, (d,), law,
+        f"{of} - {d.name} sign({of}) where |{of}| > {d.name}, else 0 (smooth)", width=width,
     )  # fmt: skip
 
 
@@ -965,7 +1021,10 @@ def output_offset(of: str, value: Parameter) -> Term:
 
 
 def output_curve(of: str, bend: Parameter, *, lower: float, upper: float) -> Term:
-    """A bent sensor that is right at two readings: ``y + bend (y - lower) (y - upper)``."""
+    """A bent sensor that is right at two readings: ``y + bend (y - lower) (y - upper)``.
+
+    It reverses where ``bend (2 y - lower - upper) < -1``: bound ``bend`` by the output's range.
+    """
     return _added(
         "output_curve", "sensor curve", "output", of, (bend,),
         lambda at, p: at.own + p[0] * (at.own - lower) * (at.own - upper),

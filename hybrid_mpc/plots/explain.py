@@ -54,7 +54,7 @@ class Picture(Protocol):
 def error_steps(
     labels: Sequence[str], errors: Sequence[float], what: str, floor: float | None = None
 ) -> Figure:
-    """Error of each model as a bar, from the nominal prior on, with the part that each step removed.
+    """Error of each model as a bar, from the nominal prior on, with the part that each step removed as a pale bar.
 
     Args:
         labels: Labels of the bars: ``"nominal"``, ``"fitted"``, then the terms that were added or removed.
@@ -83,12 +83,7 @@ def error_steps(
         ax.barh(k, value, color=ink, height=0.62)
         if math.isfinite(before) and before > value:  # the part of the error that the step removed
             ax.barh(k, before - value, left=value, color=ink, alpha=0.18, height=0.62)
-        share = (
-            f" ({100 * value / before:.0f} % of the bar above)"
-            if k and math.isfinite(before) and before > 0
-            else ""
-        )
-        ax.text(max(value, before if math.isfinite(before) else 0.0) + 0.01 * top, k, f"{number(value)}{share}",
+        ax.text(max(value, before if math.isfinite(before) else 0.0) + 0.01 * top, k, number(value),
                 va="center", fontsize=9, color=INK)  # fmt: skip
     ax.set_yticks(range(len(labels)), [_break_lines(plain(label)) for label in labels])
     ax.invert_yaxis()

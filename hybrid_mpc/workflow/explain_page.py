@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from hybrid_mpc.identify.explain import DOUBT, HARM, WORTH
+from hybrid_mpc.identify.explain import DOUBT, GAIN, POOR, WORTH
 from hybrid_mpc.identify.explanation import ExplainStep, Explanation, Trial, bound
 from hybrid_mpc.plots import explain as plots
 from hybrid_mpc.plots.style import save
@@ -15,6 +15,8 @@ from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.workflow.explained import ExplainResult, state_of
 
 PAGE = "explain.html"
+RATIO = "ratio to the previous step"
+"""Heading of the ratios of errors, on the page and in the terminal."""
 SPREADS = "over the outputs' spreads"
 MODELS = {"nominal": "prior, nominal", "fitted": "prior, fitted", "explained": "prior with the found terms"}
 
@@ -34,8 +36,9 @@ def write_page(out: Path, scenario: Scenario, found: ExplainResult, command: Seq
         Section(
             "Error by step",
             (
-                "Each bar is the error of free runs over held-out recordings. The pale part is the reduction by the "
-                "step. The dashed line is the sensor noise.",
+                "Each bar is the error of free runs over held-out recordings, all samples together. The pale part is "
+                "the reduction by the step. The dashed line is the sensor noise.",
+                f"The ratio to the previous step is another statistic: the {explanation.averaged}.",
             ),
             ((steps, "Held-out error of the nominal prior, of the fitted prior, and after each step."),),
             (steps_table(explanation), *([tests_table(found)] if found.tests else [])),
@@ -109,13 +112,14 @@ def steps_table(explanation: Explanation) -> Table:
         for s in explanation.steps
     ]  # fmt: skip
     return Table(
-        ("step", "held-out error [-]", "ratio to the step before", "fitted values", "alternatives"),
+        ("step", "held-out error [-]", RATIO, "fitted values", "alternatives"),
         [
             ("prior, nominal", explanation.nominal, None, "", ""),
             ("prior, fitted", explanation.before, None, "", ""),
             *rows,
         ],
-        "Steps of the search. The intervals hold for all fitted candidates of a step together.",
+        f"Steps of the search, evaluated on {explanation.evidence.text}. Errors: all samples together. Ratios: "
+        f"{explanation.averaged}, with an interval for all fitted candidates of a step together.",
     )
 
 
@@ -187,24 +191,27 @@ def _about_terms(explanation: Explanation) -> Sequence[str]:
 def _judged(explanation: Explanation) -> Sequence[str]:
     own = explanation.evidence
     return (
-        f"Evidence: {own.text}; free runs of {own.length:.3g} s. Similar recordings are held out together.",
+        f"The search is evaluated on {own.text}, in free runs of {own.length:.3g} s. Similar recordings are held out "
+        "together.",
         f"The search chose from {explanation.candidates} candidates. Each step scores all candidates by one "
         "Gauss-Newton step. The best candidates are fitted in every fold, with all parameters and initial states.",
-        f"A term is added if the held-out error is below {WORTH:g} of the error before, and if the probability of a "
-        f"{HARM - 1:.0%} larger error is below {DOUBT:g} for all fitted candidates of the step together.",
-        "Errors are root mean squares, divided by the outputs' spreads.",
+        f"A term is added if its ratio to the previous step is below {WORTH:g} and the upper end of its interval is "
+        f"below 1. The ratio is the {explanation.averaged}. The true ratio lies beyond one end of the interval with a "
+        f"probability of {DOUBT:.0%}, for all fitted candidates of the step together. In the upper end, a reduction by "
+        f"more than {1 - GAIN:.0%} counts as {1 - GAIN:.0%}.",
+        "A term is not added if its parameters are not identifiable, if one ends at its bound, or if the error with "
+        f"the term stays above {POOR:g} and its ratio above {GAIN:g}.",
+        "Errors are root mean squares over all held-out samples, divided by the outputs' spreads.",
     )
 
 
 def _figures(explanation: Explanation) -> Sequence[KeyFigure]:
-    removed = 100.0 * (1.0 - explanation.after.ratio)
-    ratio = f"ratio {explanation.after.ratio:.2f}, {bound(explanation.after.upper)}"
     error = explanation.steps[-1].held_out.error if explanation.steps else explanation.before
     return (
         KeyFigure("Found terms", len(explanation.found), "", f"of {explanation.candidates} candidates"),
         KeyFigure("Held-out error, fitted prior", explanation.before, "", SPREADS),
         KeyFigure("With the terms", error, "", SPREADS),
-        KeyFigure("Removed", round(removed), "%", ratio,
+        KeyFigure("Ratio with to without the terms", round(explanation.after.ratio, 2), "", explanation.averaged,
                   "good" if explanation.found else "plain"),
     )  # fmt: skip
 

@@ -193,7 +193,7 @@ class Search:
             self._keep("steps", explanation)
             last = next(step for step in reversed(explanation.steps) if step.action == "added")
             progress.finish(
-                f"{last.name}: the held-out error is {last.held_out.ratio:.2f} of the error before"
+                f"{last.name}: ratio to the previous step {last.held_out.ratio:.2f}, {explanation.averaged}"
             )
             if _added(explanation) < self.most:
                 progress.start(f"search, step {1 + _added(explanation)}")

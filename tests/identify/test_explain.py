@@ -24,7 +24,7 @@ from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import visited
 from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.machine import terms
-from hybrid_mpc.machine.terms import Term, extended
+from hybrid_mpc.machine.terms import At, Term, extended
 from hybrid_mpc.records import plain, record
 
 DT = 0.02
@@ -137,6 +137,43 @@ def test_every_term_of_the_library_vanishes_where_the_search_begins():
         rtol=1e-12,
     )
     assert len(every) > 20
+
+
+def slopes_of(term, values, grid):
+    """Slopes of a map of an input or sensor along a grid."""
+    own = ca.SX.sym("own")
+    nothing = dict.fromkeys(At._fields)
+    value = term.law(At(**{**nothing, "own": own}), ca.DM(values))
+    return ca.Function("slope", [own], [ca.gradient(value, own)]).map(len(grid))(grid).full().ravel()
+
+
+def test_no_map_of_an_input_or_sensor_reverses_within_its_bounds():
+    """Also where the recordings cover a small part of the signal's range, and without a range."""
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-0.3, 0.3, (200, 2)), rng.standard_normal((200, 1)) * 0.4
+
+    class Unbounded(Pendulum):
+        inputs = (Signal("torque", "N m"),)
+        outputs = (Signal("phi", "rad"),)
+
+    laws = set()
+    for prior, (low, high) in ((Pendulum(), (-10.0, 10.0)), (Unbounded(), (-0.4, 0.4))):
+        for candidate in library(prior, (x, u, np.zeros((200, 0))), DT, 2.0):
+            for form in candidate.forms:
+                if form.place in ("input", "output") and form.state is None:
+                    grid = (
+                        np.linspace(-3.0, 3.0, 601) if form.place == "input" else np.linspace(low, high, 601)
+                    )
+                    if form.place == "input" and prior.inputs[0].upper == np.inf:
+                        grid = np.linspace(1.5 * u.min(), 1.5 * u.max(), 601)
+                    (one,) = form.parameters
+                    for value in np.linspace(one.lower, one.upper, 21):
+                        assert slopes_of(form, [value], grid).min() > 0.0, (form.name, value)
+                    laws.add(form.made.maker)
+    assert laws == {
+        "input_gain", "input_offset", "gain_by_direction", "dead_zone", "saturation", "input_curve",
+        "output_gain", "output_offset", "output_curve",
+    }  # fmt: skip
 
 
 def own(law, unit="N m", upper=1.0, name="own", **more):

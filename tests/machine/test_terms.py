@@ -99,6 +99,27 @@ def test_a_term_vanishes_at_zero_and_acts_elsewhere(name):
         assert (max(off) > 1e-3) == acts
 
 
+@pytest.mark.parametrize("width", [1e-3, 0.1535, 2.0])
+@pytest.mark.parametrize("d", [0.0, 1e-3, 0.2527, 3.0])
+def test_a_dead_zone_never_reverses_its_input(d, width):
+    """Also where the zone is wider than the bend at its ends."""
+    made = extended(Arm, terms.dead_zone("t1", p("z", d, low=0.0), width=width))()
+    u = ca.SX.sym("u", 2)
+    equations = made.equations.xdot([0.0] * 4, u, [], made.p)
+    plain = Arm()
+    acting = ca.Function("acting", [u], [plain.masses([0.0, 0.0], plain.p)[0, :] @ equations[2:]])
+    grid = np.concatenate([np.linspace(-5.0, 5.0, 2001), 1e4 * np.array([-1.0, 1.0])])
+    at = np.stack([grid, np.zeros_like(grid)])
+    value = acting.map(len(grid))(at).full().ravel()
+    slope = ca.Function("slope", [u], [ca.gradient(acting(u), u)[0]]).map(len(grid))(at).full().ravel()
+    assert slope.min() >= -1e-12
+    assert slope.max() <= 1.0 + 1e-12
+    np.testing.assert_allclose(value[-2:], np.sign(grid[-2:]) * (1e4 - d), rtol=0, atol=1e-3)
+    assert acting([0.0, 0.0]) == pytest.approx(0.0, abs=1e-12)
+    if d == 0.0:
+        np.testing.assert_allclose(value, grid, rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", arm_terms(0.0))
 def test_the_energy_balance_holds_with_a_term(name):
     """What is stored changes by what is supplied less what is lost, along a fine integration; no friction supplies."""
@@ -147,6 +168,17 @@ def test_terms_of_processes_add_to_rates_and_balances():
     (volume,) = made.equations.balances
     assert float(volume.loss(x, u, w, made.p)) == pytest.approx(0.1 + 0.5 * 0.2, rel=1e-5)
     assert float(volume.supply(x, u, w, made.p)) == pytest.approx(0.2 + 0.1 * 10.0)
+
+
+@pytest.mark.parametrize(
+    ("kelvin", "text"), [(273.15, "(heat + 273.15)^4 - 292.25^4"), (0.0, "heat^4 - 19.1^4")]
+)
+def test_the_formula_of_radiation_is_in_kelvin_and_has_its_value(kelvin, text):
+    radiation = terms.radiation("heat", p("e", 0.02, "degC/s 1e8/K^4"), kelvin=kelvin, surroundings=19.1)
+    assert text in radiation.text
+    rate = extended(Tank, radiation)().equations.xdot([1.0, 80.0], [0.1], [20.0], [0.1, 0.02])[1]
+    value = eval(radiation.text.replace("-e", "-0.02 *").replace("^", "**"), {"heat": 80.0})
+    assert float(rate) == pytest.approx(0.01 * (20.0 - 80.0) + value, rel=1e-6)
 
 
 def test_an_own_term_takes_a_few_lines():

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from machine_runs import recording, write
 import hybrid_mpc as hm
 from hybrid_mpc import InputError, RunSettings, extended, load_scenario, terms, with_nominal
 from hybrid_mpc.check.preflight import check_scenario
+from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.data.scales import time_unit
+from hybrid_mpc.identify.explain import WORTH
 from hybrid_mpc.plots.explain import error_steps
-from hybrid_mpc.workflow import explain_search
+from hybrid_mpc.workflow import explain_page, explain_search
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain import read_result
 from hybrid_mpc.workflow.explain_search import chosen_terms
@@ -62,6 +65,24 @@ def test_its_page_shows_the_steps_and_the_term(explained):
         assert words in page
     assert {p.name for p in (out / "figures").iterdir()} == {"error_by_step.png", "step_1_1.png"}
     assert page.count("data:image/png") == 2
+
+
+def test_ratios_are_one_statistic_with_one_name(explained, machine):
+    """Page, table and file say of what the ratio is the mean; the bars show errors alone, without a ratio."""
+    out, found = explained
+    told, words = found.explanation, found.explanation.averaged
+    assert str(told.evidence.pieces) in words
+    page = (out / "explain.html").read_text()
+    assert words in page
+    assert words in explain_page.steps_table(told).caption
+    assert explain_page.RATIO in explain_page.steps_table(told).columns
+    assert words in " ".join(summary(found, out))
+    assert words in (out / found.file).read_text()
+    figure = error_steps(*explain_page.bars_of(told), "error [-]")
+    assert not any("%" in text.get_text() for text in figure.axes[0].texts)
+    rule = f"below {WORTH:g} and the upper end of its interval is below 1"
+    assert rule in page
+    assert rule in (Path(__file__).parents[2] / "docs/explain.md").read_text()
 
 
 def test_its_scenario_has_the_prior_of_the_explanation(explained, machine, files, call):
@@ -209,6 +230,45 @@ def test_a_found_state_leaves_the_control_problem_to_the_user(machine, explained
     assert [s.name for s in scenario.prior().states][-1] == "s_tau"
     assert scenario.prior().values["t_tau"] == 0.2
     check_scenario(scenario)
+
+
+def test_the_written_operating_point_is_an_equilibrium_with_the_found_terms(machine, explained, tmp_path):
+    """An offset of the torque moves the equilibrium; a parameter that is fixed later in the base file says so."""
+    _, found = explained
+    told, path = found.explanation, tmp_path / "base.py"
+    path.write_text((machine / "my_machine.py").read_text())
+    shift = terms.input_offset("tau", hm.Parameter("o_tau", 0.0, "N m", -1.0, 1.0))
+    term = replace(told.found[0], name=shift.name, made=shift.made)
+    value = replace(told.parameters[-1], name="o_tau", value=0.3, lower=-1.0, upper=1.0)
+    changed = replace(
+        told, steps=(replace(told.steps[0], terms=(term,)),), parameters=(*told.parameters[:-1], value)
+    )
+    file = tmp_path / "shifted.py"
+    file.write_text(scenario_code(load_scenario(str(path)), str(path), changed, tmp_path))
+    scenario = load_scenario(str(file))
+    old = type(load_scenario(str(path)).prior()).operating_point
+    point = scenario.prior().operating_point
+    assert point.x == old.x
+    assert point.u[0] == pytest.approx(old.u[0] - 0.3)
+    check_scenario(scenario)
+    fixed = next(p for p in scenario.prior().parameters if p.name != "o_tau" and p.value != p.lower)
+    kind = "class Fixed"
+    path.write_text(
+        path.read_text()
+        + f"""
+class Fixed(type(scenario.prior())):
+    parameters = tuple(
+        dataclasses.replace(p, value=p.lower, upper=p.lower) if p.name == {fixed.name!r} else p
+        for p in type(scenario.prior()).parameters
+    )
+scenario = dataclasses.replace(scenario, prior=Fixed)
+"""
+    )
+    with pytest.raises(InputError) as refused:
+        load_scenario(str(file))
+    assert "HM-MACHINE-045" in str(refused.value)
+    assert kind in str(refused.value)
+    assert str(path) in str(refused.value)
 
 
 def test_bars_without_a_finite_error_are_refused():

@@ -11,7 +11,7 @@ from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.compare import REPORTED, closed_loops
-from hybrid_mpc.workflow.stages.promises import STRUCTURE
+from hybrid_mpc.workflow.stages.promises import SEARCH, STRUCTURE
 from hybrid_mpc.workflow.stages.results import Results
 
 EXPLAINED = 60.0
@@ -20,7 +20,6 @@ HELD = (0.10, 0.07)
 """How far a band's coverage of test data may lie below and above its nominal share: 80 to 97 % for a 90 % band."""
 FLOOR = 1.5
 """Ratio of free-run error to sensor noise up to which sensor noise explains the error."""
-SEARCH = "hybrid-mpc explain looks for missing terms (docs/explain.md)."
 MOST = 4
 """Largest number of warnings of one kind among the hints; the report's sections list all."""
 

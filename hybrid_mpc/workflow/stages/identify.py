@@ -149,6 +149,7 @@ class PriorResult:
         error_correlation: Correlation of successive one-step errors of the smoother, by output; zero is white.
         longest_run: Length [s] of the free runs that models are judged by; None: whole recordings.
         arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
+        lacking: Those of ``in_doubt`` that a missing term can explain: bounds, better simpler models, a poor FIT.
     """
 
     fit: PriorFit
@@ -162,6 +163,7 @@ class PriorResult:
     error_correlation: Mapping[str, float]
     longest_run: float | None
     arrays: Mapping[str, Array] = beside()
+    lacking: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -352,20 +354,19 @@ def examined_prior(context: Context) -> PriorResult:
     length = longest_run or longest or trial
     context.progress.update("free runs", 1, 1, "looking for wrong terms")
     off = zip(errors["phy"].rmse.items(), smoother.sizes.y, strict=True)
-    reasons = [
-        named(causes(make, fit.values, acting, spec.dt, length, unit)),
-        bounds_doubt(bounds, len(fit.standard_errors)),
-    ]
+    wrong = named(causes(make, fit.values, acting, spec.dt, length, unit))
+    lacks = [bounds_doubt(bounds, len(fit.standard_errors))]
     # where small errors grow, errors of initial states grow too: then the windows of the fit, with free initial states,
     # test the equations
     short = grows and longest_run is not None
     follows = short and min(row["validation_error"] for row in fit.stages) <= POOR
     if not follows:
-        reasons += [
+        lacks += [
             structure_doubt(own["phy"], simpler),
             fit_doubt(errors["phy"].fit_percent, {name: e / size for (name, e), size in off}),
         ]
-    in_doubt = tuple(one for one in reasons if one)
+    lacking = tuple(one for one in lacks if one)
+    in_doubt = (*([wrong] if wrong else []), *lacking)
     for doubt in in_doubt:
         context.progress.warn(f"{IN_DOUBT}: {doubt}")
     one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
@@ -383,6 +384,7 @@ def examined_prior(context: Context) -> PriorResult:
         },
         longest_run=longest_run,
         arrays={f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
+        lacking=lacking,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,12 +12,17 @@ from hybrid_mpc.compare.loops import LoopRow
 from hybrid_mpc.compare.promises import TaskEnd, Tested, examine, task_end
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.choose import CandidateFigures, Choice
+from hybrid_mpc.identify.explanation import Explanation
+from hybrid_mpc.identify.sound import CLEARLY
 from hybrid_mpc.kit.promises import Promise, PromiseTable, read_promises, write_promises
 from hybrid_mpc.scenario import Task
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage
+from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.compare import CONTROL, what_loops_read
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION
+from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE
 from hybrid_mpc.workflow.stages.identify import PRIOR, PriorResult
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, what_on_model_reads
@@ -25,6 +31,8 @@ STRUCTURE = "structure of the prior"
 """Name of the row about the prior, which all models are based on."""
 MEND = "Correct the prior first: docs/prior-wrong.md explains each reason."
 """Remedy for a prior whose structure is in doubt."""
+SEARCH = "hybrid-mpc explain looks for missing terms (docs/explain.md)."
+"""Remedy for a prior that may lack a term."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +67,25 @@ def promises_stage(context: Context) -> PromisesResult | Absent:
         tested=_tested(context, controller, kit.models[kit.recommended].n_y),
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
-    result = PromisesResult((structure(context.prior), *found), kit.identity)
+    explained = context.find(EXPLAIN)
+    row = structure(
+        context.prior,
+        context.read(CHOICE).choice,
+        None if isinstance(explained, Absent) else explained.explanation,
+    )
+    result = PromisesResult((row, *found), kit.identity)
     put_promises(context, result)
     return result
 
 
-def structure(prior: PriorResult) -> Promise:
-    """Row of the table: whether the structure of the fitted prior is in doubt."""
+def structure(prior: PriorResult, choice: Choice, explained: Explanation | None = None) -> Promise:
+    """Row of the table: whether the structure of the fitted prior is in doubt.
+
+    Args:
+        prior: The fitted prior, with the doubts about its present terms and signals.
+        choice: The networks beside it: a clearly lower held-out error is a sign of a missing term.
+        explained: Result of the search for missing terms. Default: none was made.
+    """
     errors = {
         "the fitted prior": prior.errors["phy"].error,
         "the nominal one": prior.errors["phy_nominal"].error,
@@ -73,9 +93,33 @@ def structure(prior: PriorResult) -> Promise:
     errors |= {name: one.errors.error for name, one in prior.baselines.items() if one.errors is not None}
     figures = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
     evidence = f"free-run error on test recordings over the outputs' spread: {figures}"
-    if not prior.in_doubt:
-        return Promise(STRUCTURE, "shown", f"no term or signal is in doubt; {evidence}")
-    return Promise(STRUCTURE, "doubted", f"{'; '.join(prior.in_doubt)}; {evidence}", MEND)
+    if prior.in_doubt:
+        search = f" {SEARCH}" if prior.lacking and explained is None else ""
+        return Promise(STRUCTURE, "doubted", f"{'; '.join(prior.in_doubt)}; {evidence}", f"{MEND}{search}")
+    present = (
+        "the prior's present terms and signals were tested (signs, units, factors, bounds): none is in doubt"
+    )
+    own = choice.candidates.get(choice.hybrid)
+    gain = ""
+    if own is not None and network_gains(choice, own):
+        gain = f"; with {choice.hybrid}, the held-out error is {own.ratio:.2f} times that of the fitted prior"
+    if explained is not None:
+        terms = ", ".join(term.name for term in explained.found) or "none"
+        return Promise(
+            STRUCTURE, "shown", f"{present}; missing terms found by the search: {terms}{gain}; {evidence}"
+        )
+    if gain:
+        why = f"{present}{gain}, so a physical term may be missing; {evidence}"
+        return Promise(STRUCTURE, "doubted", why, SEARCH)
+    return Promise(STRUCTURE, "shown", f"{present}; missing terms were not searched for; {evidence}")
+
+
+def network_gains(choice: Choice, own: CandidateFigures) -> bool:
+    """Whether a network's held-out error is clearly lower than that of the fitted prior, or a network is recommended
+    for its lower error.
+    """
+    recommended = choice.recommended == choice.hybrid or choice.hybrid in choice.sure
+    return math.isfinite(own.ratio) and own.ratio < (1.0 if recommended else CLEARLY)
 
 
 def _tasks(context: Context) -> tuple[Task, ...]:
@@ -130,5 +174,5 @@ def what_promises_read(context: Context) -> Mapping[str, object]:
 
 PROMISES = Stage(
     "promises", "examining the kit's promises", PromisesResult, promises_stage, what_promises_read,
-    (PRIOR, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
+    (EXPLAIN, PRIOR, CHOICE, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
 )  # fmt: skip

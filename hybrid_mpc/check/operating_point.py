@@ -1,0 +1,105 @@
+"""Check that a prior's operating point is an equilibrium, and search for the equilibria beside one that is not."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_mpc.check.prior import DRIFT
+from hybrid_mpc.identify.simulation import rest_of
+from hybrid_mpc.machine.prior import OperatingPoint, Prior
+from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.equilibrium import RateEquations, rate_search
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+SHOWN, WRITTEN = 6, 10
+"""Significant digits of a point in a message and in a file."""
+
+
+def drift_at_rest(prior: Prior, second: float) -> str:
+    """The states that move at the operating point, as text; empty if none moves, or no point is given.
+
+    ``second`` is the time [s] within which a state may drift by a hundredth of its size.
+    """
+    if prior.operating_point is None:
+        return ""
+    x, u, w = rest_of(prior)
+    rates = prior.equations.xdot(x, u, w, prior.p).full().ravel()
+    return ", ".join(
+        f"{s.name} changes by {r:.3g} {s.unit} per second"
+        for s, r, size in zip(prior.states, rates, sizes_of(prior.states, x), strict=True)
+        if abs(r) * second > DRIFT * size
+    )
+
+
+def held_states(prior: Prior) -> OperatingPoint | None:
+    """The equilibrium at the operating point's input that Newton's method finds from its states; None if there is none
+    within the ranges.
+    """
+    return _search(prior, np.arange(len(prior.states)))
+
+
+def holding_input(prior: Prior) -> OperatingPoint | None:
+    """The input within its range that holds the operating point's states; None if there is none.
+
+    States that belong to terms, such as that of a lag, follow the input.
+    """
+    n_x, own = len(prior.states), len(getattr(type(prior), "base", type(prior)).states)
+    return _search(prior, np.arange(own, n_x + len(prior.inputs)))
+
+
+def steady_point(prior: Prior) -> OperatingPoint | None:
+    """An equilibrium to replace an operating point that is none: its states with the input that holds them, else the
+    states that its input holds, else the nearest one of other states and inputs; None if none is found.
+
+    Example:
+        >>> class Tank(Prior):
+        ...     states = outputs = (Signal("level", "m", 0.0, 2.0),)
+        ...     inputs, parameters = (Signal("inflow", "m/s", 0.0, 1.0),), ()
+        ...     operating_point = OperatingPoint((1.0,), (0.3,))
+        ...     def xdot(self, x, u, w, p):
+        ...         return (u.inflow - 0.5 * x.level,)
+        >>> steady_point(Tank()), held_states(Tank())
+        (OperatingPoint(x=(1.0,), u=(0.5,), w=()), OperatingPoint(x=(0.6,), u=(0.3,), w=()))
+    """
+    both = np.arange(len(prior.states) + len(prior.inputs))
+    return holding_input(prior) or held_states(prior) or _search(prior, both)
+
+
+def both_ways(prior: Prior) -> str:
+    """The two equilibria beside an operating point that is none, as text to copy."""
+    held, holding = held_states(prior), holding_input(prior)
+    states = "no states within their ranges" if held is None else f"x = {_numbers(held.x)}"
+    inputs = "no input within its range" if holding is None else f"u = {_numbers(holding.u)}"
+    if holding is not None and any(
+        abs(a - b) > 1e-9 * max(1.0, abs(b)) for a, b in zip(holding.x, rest_of(prior)[0], strict=True)
+    ):
+        inputs += f" with x = {_numbers(holding.x)}"
+    return f"The states that this input holds: {states}. The input that holds these states: {inputs}"
+
+
+def sizes_of(signals: tuple[Signal, ...], at: Array) -> Array:
+    """Size of each signal: its range, else its value, at least 1."""
+    ranges = np.array([s.upper - s.lower for s in signals], dtype=np.float64)
+    return np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(at), 1.0))
+
+
+def _search(prior: Prior, free: Places) -> OperatingPoint | None:
+    """The equilibrium that a search over the free ones of ``(x, u)`` finds from the operating point."""
+    (x, u, w), n_x = rest_of(prior), len(prior.states)
+    ranges = np.array([s.upper - s.lower for s in prior.inputs], dtype=np.float64)
+    sizes = np.where(np.isfinite(ranges), ranges, np.where(u != 0, np.abs(u), 1.0))
+    near, scale = np.concatenate([x, u]), np.concatenate([sizes_of(prior.states, x), sizes])
+    equations = RateEquations(prior.equations.xdot, w, prior.p)
+    found = rate_search(equations, scale, near, np.zeros(n_x), free=free).descend(near, x)
+    signals = (*prior.states, *prior.inputs)
+    if not found.steady or not all(s.lower <= v <= s.upper for s, v in zip(signals, found.v, strict=True)):
+        return None
+    # what the search left alone keeps its exact value
+    values = [float(f"{v:.{WRITTEN}g}") + 0.0 if k in free else float(near[k]) for k, v in enumerate(found.v)]
+    return OperatingPoint(tuple(values[:n_x]), tuple(values[n_x:]), tuple(w.tolist()))
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return str([float(f"{v:.{SHOWN}g}") for v in values])

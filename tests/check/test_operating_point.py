@@ -1,0 +1,72 @@
+"""An operating point that is no equilibrium: the two equilibria beside it, and the one that replaces it."""
+
+import numpy as np
+import pytest
+
+from hybrid_mpc import OperatingPoint, Parameter, Prior, Signal, extended, terms, with_nominal
+from hybrid_mpc.check.operating_point import (
+    both_ways,
+    drift_at_rest,
+    held_states,
+    holding_input,
+    steady_point,
+)
+
+INFLOW = Signal("inflow", "m/s", 0.0, 1.0)
+
+
+class Tank(Prior):
+    states = outputs = (Signal("level", "m", 0.0, 2.0),)
+    inputs, parameters = (INFLOW,), (Parameter("k", 0.5, "1/s", 0.1, 1.0),)
+    operating_point = OperatingPoint((1.0,), (0.3,))
+
+    def xdot(self, x, u, w, p):
+        return (u.inflow - p.k * x.level,)
+
+
+class Two(Prior):
+    """One input cannot hold two levels of any choice."""
+
+    states = outputs = (Signal("one", "m", 0.0, 2.0), Signal("two", "m", 0.0, 2.0))
+    inputs, parameters = (INFLOW,), (Parameter("k", 0.5, "1/s", 0.1, 1.0),)
+    operating_point = OperatingPoint((1.0, 0.4), (0.5,))
+
+    def xdot(self, x, u, w, p):
+        return u.inflow - p.k * x.one, p.k * (x.one - x.two)
+
+
+def test_both_equilibria_beside_a_point_have_their_numbers():
+    prior = Tank()
+    assert drift_at_rest(prior, 1.0)
+    assert holding_input(prior) == OperatingPoint((1.0,), (0.5,))
+    assert held_states(prior) == OperatingPoint((0.6,), (0.3,))
+    assert "x = [0.6]" in both_ways(prior)
+    assert "u = [0.5]" in both_ways(prior)
+    assert steady_point(prior) == holding_input(prior)
+
+
+def test_what_the_inputs_cannot_hold_moves_to_the_states_that_they_hold():
+    assert holding_input(Two()) is None
+    assert "x = [1.0, 1.0]" in both_ways(Two())
+    np.testing.assert_allclose(steady_point(Two()).x, [1.0, 1.0])
+    assert steady_point(Two()).u == (0.5,)
+
+
+def test_an_input_beyond_its_range_holds_nothing():
+    class Wide(Tank):
+        operating_point = OperatingPoint((1.5,), (0.3,))
+        parameters = (Parameter("k", 0.9, "1/s", 0.1, 1.0),)
+
+    assert holding_input(Wide()) is None
+    assert steady_point(Wide()).x == pytest.approx((1 / 3,))
+
+
+def test_states_of_terms_follow_the_input_that_holds_the_machine():
+    lag = terms.input_lag("inflow", Parameter("tau", 2.0, "s", 0.1, 9.0), state=Signal("acting", "m/s"))
+    leak = terms.offset("level", Parameter("r", -0.1, "m/s", -1.0, 1.0), place="rate")
+    kind = extended(Tank, lag, leak)
+    point = steady_point(kind())
+    np.testing.assert_allclose([*point.x, *point.u], [1.0, 0.6, 0.6])
+    moved = with_nominal(kind, {"k": 0.5}, point)
+    assert moved.operating_point == with_nominal(moved, {}).operating_point == point
+    assert drift_at_rest(moved(), 1e3) == ""
