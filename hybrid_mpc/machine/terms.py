@@ -254,7 +254,7 @@ def _beyond(base: Any, values: Mapping[str, float]) -> Iterator[str]:
                 f"with_nominal: {p.name} = {value:g} {p.unit} lies outside [{p.lower:g}, {p.upper:g}]: {where} {what}. "
                 f"Leave {p.name} out of the values to keep {p.value:g} (in a file of hybrid-mpc explain: delete its "
                 f"line of FITTED), widen its bounds there, or run hybrid-mpc explain again with the new bounds "
-                "[HM-MACHINE-045]"
+                "[HM-MACHINE-046]"
             )
 
 

@@ -266,7 +266,7 @@ scenario = dataclasses.replace(scenario, prior=Fixed)
     )
     with pytest.raises(InputError) as refused:
         load_scenario(str(file))
-    assert "HM-MACHINE-045" in str(refused.value)
+    assert "HM-MACHINE-046" in str(refused.value)
     assert kind in str(refused.value)
     assert str(path) in str(refused.value)
 
