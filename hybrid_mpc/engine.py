@@ -53,6 +53,9 @@ class Progress:
     def warn(self, text: str) -> None:
         """A warning that does not stop the job."""
 
+    def note(self, text: str) -> None:
+        """A remark that asks for nothing, e.g. how a file was read."""
+
     def finish(self, text: str) -> None:
         """The stage has ended."""
 

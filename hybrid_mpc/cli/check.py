@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
-from hybrid_mpc.rules import printable
+from hybrid_mpc.rules import counted, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,12 +74,14 @@ def check(
         problems, found_warnings, in_doubt = _fit(console, context)
         warnings += found_warnings
     left = left_to_decide(Path(scenario)) if scenario.endswith(".py") else []
+    notes = () if found.dataset is None else found.dataset.notes
+    doubts = "doubt about the structure of the prior", "doubts about the structure of the prior"
     for texts, style, title in (
-        (left, "cyan", "left to decide"), (warnings, "yellow", "warnings"),
-        (in_doubt, "bold yellow", "doubts about the structure of the prior"), (problems, "bold red", "errors"),
+        (notes, "", ("note",)), (left, "cyan", ("left to decide", "left to decide")),
+        (warnings, "yellow", ("warning",)), (in_doubt, "bold yellow", doubts), (problems, "bold red", ("error",)),
     ):  # fmt: skip
         if texts:
-            console.print(f"\n{len(texts)} {title}", style=style)
+            console.print(f"\n{counted(len(texts), *title)}", style=style)
         for number, text in enumerate(texts, 1):
             console.print(printable(f"{number:3}. {text}"), markup=False, soft_wrap=True)
     if problems:

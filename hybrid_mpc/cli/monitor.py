@@ -79,8 +79,10 @@ def monitor(
         machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration, residuals=residuals,
     )  # fmt: skip
-    for finding in job.data.findings:
-        say(f"warning: {finding}")
+    for warning in job.data.warnings:
+        say(f"warning: {warning}")
+    for note in job.data.notes:
+        say(f"note: {note}")
     if learn:
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)

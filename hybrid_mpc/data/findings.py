@@ -101,6 +101,11 @@ class Finding:
     message: str
     refused: bool = False
 
+    @property
+    def is_note(self) -> bool:
+        """Whether it says only what was done unambiguously while reading: nothing is doubtful, nothing left to do."""
+        return self.kind == "read"
+
     def __str__(self) -> str:
         return f"{self.file}: {self.message}"
 

@@ -59,6 +59,12 @@ def warned(results: Results, warning: str) -> Results:
     return replace(results, data=replace(results.data, warnings=(warning,)))
 
 
+def test_how_a_file_was_read_asks_for_nothing(results):
+    """A note on the recordings is no hint."""
+    noted = replace(results, data=replace(results.data, notes=("a.csv: as it was read: a decimal comma",)))
+    assert advice(noted) == advice(results)
+
+
 def better(results: Results, error: float) -> dict[str, object]:
     """Baselines of which ARX has an error."""
     arx = results.prior.baselines["ARX"]

@@ -87,6 +87,7 @@ class DataResult:
         pieces: Number of trajectories by role.
         seconds: Their length [s] by role.
         warnings: Warnings about the recordings.
+        notes: How files were read that needed more than a plain table.
     """
 
     files: tuple[str, ...]
@@ -95,6 +96,7 @@ class DataResult:
     pieces: Mapping[str, int]
     seconds: Mapping[str, float]
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -218,6 +220,8 @@ def data_stage(context: Context) -> DataResult:
     dataset, warnings = context.dataset, doubts(context)
     for warning in warnings:
         context.progress.warn(warning)
+    for note in dataset.notes:
+        context.progress.note(note)
     return DataResult(
         tuple(dataset.files),
         dataset.hash,
@@ -225,6 +229,7 @@ def data_stage(context: Context) -> DataResult:
         {role: len(context.trajectories(role)) for role in ROLES},
         {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in ROLES},
         warnings,
+        dataset.notes,
     )
 
 
@@ -242,7 +247,7 @@ def doubts(context: Context) -> tuple[str, ...]:
     Raises:
         InputError: If a recording is bad, or an input or output is constant in all training recordings.
     """
-    found = tuple(str(finding) for finding in context.dataset.findings)
+    found = context.dataset.warnings
     prior = context.scenario.prior()
     free = sum(not p.fixed for p in prior.parameters)
     train = context.trajectories("train")

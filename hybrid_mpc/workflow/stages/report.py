@@ -220,7 +220,10 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if absent:
         reasons = dict.fromkeys(one.reason for one in absent)
         after["estimation"] = (f"Observers were not tested: {'; '.join(reasons)}.",)
-    after["data"] = tuple(f"Warning: {text}" for text in results.data.warnings)
+    after["data"] = (
+        *(f"Warning: {text}" for text in results.data.warnings),
+        *(f"Note: {text}" for text in results.data.notes),
+    )
     replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
     lacking = "mopgrnn" not in models_of(context.scenario.prior())
     after["training"] = ((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()) + _prior_replay_text(
