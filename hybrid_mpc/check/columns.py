@@ -40,6 +40,15 @@ EPOCHS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3), (1e9, 1.0))
 """Smallest time since 1970 (in the year 2001) in each unit [s]; a number five times larger (after 2130) is no epoch."""
 UNIT = re.compile(r"[\w/^*·.%°²³µμΩ() -]{1,20}")
 """Pattern of a unit; any other text behind a name is not one."""
+LIMITS: Mapping[str, Sequence[float]] = {
+    "%": (-100.0, 0.0, 100.0),
+    "V": (-24.0, -12.0, -10.0, -5.0, 0.0, 5.0, 10.0, 12.0, 24.0),
+    "mA": (0.0, 4.0, 20.0),
+    "": (-1.0, 0.0, 1.0),
+}
+"""Usual limits of actuators, by unit (empty: no unit)."""
+AT_LIMIT = 2e-3
+"""Largest distance of a recorded end from such a limit, in spans."""
 DIVERGED, AGAIN = 1e12, 3
 """Least size of diverged numbers, over a column's median size; and the fewest such numbers."""
 
@@ -88,6 +97,30 @@ class Column:
             self.unit or "-",
             float(near(low - span, span / 20)),
             float(near(high + span, span / 20)),
+        )
+
+    @property
+    def limits(self) -> tuple[float | None, float | None]:
+        """Ends of the recorded range that look like limits of an actuator, None where an end does not: 0 to 100 %.
+
+        An end at exactly zero is one in any unit.
+        """
+        low, high = self.span
+        near_by = AT_LIMIT * (high - low)
+        usual = LIMITS.get("" if self.unit in ("", "-", "1") else self.unit, ())
+        below = [0.0] if low == 0.0 else [end for end in usual if 0 <= low - end <= near_by]
+        above = [0.0] if high == 0.0 else [end for end in usual if 0 <= end - high <= near_by]
+        return below[0] if below else None, above[0] if above else None
+
+    @property
+    def input_signal(self) -> Signal:
+        """The signal of an input: its range ends at recorded limits of the actuator."""
+        low, high = self.limits
+        one = self.signal
+        if one.periodic:
+            return one
+        return replace(
+            one, lower=one.lower if low is None else low, upper=one.upper if high is None else high
         )
 
 
@@ -221,13 +254,17 @@ def read_all(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
 
 
 class Clock(NamedTuple):
-    """The time: its column (None: only a sampling period), period, unit of the column and length [s], and a doubt."""
+    """The time: its column (None: only a sampling period), period, unit of the column and length [s], and a doubt.
+
+    ``periods`` [s] are those of the recordings, in their order; ``period`` is the longest.
+    """
 
     column: Column | None
     period: float
     seconds: float = 1.0
     doubt: str = ""
     length: float = 0.0
+    periods: tuple[float, ...] = ()
 
 
 def clock_of(
@@ -245,7 +282,7 @@ def clock_of(
     first = _time(sources[0], columns, left_out, asked, chosen)
     rows = next(iter(columns.values())).lengths
     if first.column is None:
-        return first._replace(length=first.period * min(rows))
+        return first._replace(length=first.period * min(rows), periods=(first.period,) * len(rows))
     full, clocks, problems = first.column.full, list[Clock](), list[str]()
     for source in sources:
         clock = (
@@ -266,7 +303,8 @@ def clock_of(
         else clock.seconds * float(np.ptp(clock.column.values))
         for clock, m in zip(clocks, rows, strict=True)
     ]
-    return first._replace(period=max(clock.period for clock in clocks), length=min(lengths))
+    periods = tuple(clock.period for clock in clocks)
+    return first._replace(period=max(periods), length=min(lengths), periods=periods)
 
 
 def _time(

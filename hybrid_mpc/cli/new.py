@@ -38,7 +38,7 @@ def new(
     draft = write_scenario(path, data, inputs, outputs, time_column, disturbances)
     lines = [
         *(f"{name}: {note}" for name, notes in draft.notes.items() for note in notes),
-        f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.period:.4g} s",
+        f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.sampling}",
         *([f"  to decide: {draft.doubt}"] if draft.doubt else []),
         f"inputs: {', '.join(c.full for c in draft.inputs)}",
         f"outputs: {', '.join(c.full for c in draft.outputs)}",
