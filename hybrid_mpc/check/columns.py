@@ -20,7 +20,7 @@ from hybrid_mpc.data.source import Columns, Source, name_and_unit
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.records import shown
-from hybrid_mpc.rules import LARGEST, column_problem
+from hybrid_mpc.rules import LARGEST, column_problem, counted
 
 Array = NDArray[np.float64]
 MOST_RECORDED = 1e-3 * LARGEST
@@ -145,7 +145,9 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
             if full in one.faults:
                 problems.append(f"{one.faults[full]}{where}")
             elif rows and len(one.values) not in (1, rows):
-                problems.append(f"it has {len(one.values)} values{where}, but the other columns have {rows}")
+                problems.append(
+                    f"it has {counted(len(one.values), 'value')}{where}, but the other columns have {rows}"
+                )
             elif (k := _diverges(pieces[-1])) is not None:
                 diverged.append(
                     f"{source.path}: {one.place(k)}, column {shown(full)}: grows to "
@@ -160,7 +162,7 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
         elif not len(known):
             left_out[full] = "it has no number"
         elif len(known) < FEWEST or max(map(len, pieces)) == 1:
-            left_out[full] = f"it has {len(known)} number{'s' * (len(known) > 1)}, fewer than {FEWEST}"
+            left_out[full] = f"it has {counted(len(known), 'number')}, fewer than {FEWEST}"
         elif known.min() == known.max():
             left_out[full] = f"it is constant at {known[0]:g}"
         elif np.abs(known).max() > MOST_RECORDED:

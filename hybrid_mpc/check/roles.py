@@ -568,7 +568,11 @@ class _Judge:
                     )
                 else:
                     self._say(trait, "disturbance", "no input affects it, and it affects outputs", False)
-            elif free and any(self.links.into(t, inputs) >= ACTS for t in outputs if t.said != "measured"):
+            elif (
+                trait.said == "quantity"
+                and free
+                and any(self.links.into(t, inputs) >= ACTS for t in outputs if t.said != "measured")
+            ):
                 # inputs that affect another output would show in this one, too
                 self._say(trait, "disturbance", "no input affects it", False)
             elif free and trait.said == "":

@@ -89,7 +89,24 @@ def check(
     if in_doubt:
         console.print("\nCorrect the prior before a run; docs/prior-wrong.md explains each doubt.")
         return
-    console.print("\nNo errors; continue with 'hybrid-mpc run'." if data or fit else "\nNo errors.")
+    console.print(f"\n{_end(len(left), len(warnings), recorded=bool(data or fit))}")
+
+
+def _end(left: int, warnings: int, *, recorded: bool) -> str:
+    """The last line of a check without errors: what is left to do before a run.
+
+    Example:
+        >>> _end(12, 1, recorded=True)
+        "No errors. 12 values are still marked TODO; 1 warning. Look at these, then continue with 'hybrid-mpc run'."
+        >>> _end(0, 0, recorded=True)
+        "No errors; continue with 'hybrid-mpc run'."
+    """
+    todo = [f"{counted(left, 'value is', 'values are')} still marked TODO"] if left else []
+    todo += [counted(warnings, "warning")] if warnings else []
+    if not todo:
+        return "No errors; continue with 'hybrid-mpc run'." if recorded else "No errors."
+    then = "Look at these, then continue with 'hybrid-mpc run'." if recorded else "Look at these."
+    return f"No errors. {'; '.join(todo)}. {then}"
 
 
 def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:

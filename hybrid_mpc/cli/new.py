@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from hybrid_mpc.cli.options import DisturbanceColumns, InputColumns, OutputColumns, TimeColumn
+from hybrid_mpc.rules import counted
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -57,6 +58,8 @@ def new(
     lines += [f"not used: {name} ({reason})" for name, reason in draft.left_out.items()]
     count = len(left_to_decide(path))
     words = [shlex.quote(str(path)), *(f"--data {shlex.quote(str(file))}" for file in data)]
-    lines.append(f"{path}: {count} lines are left to decide. Next: hybrid-mpc check {' '.join(words)}")
+    lines.append(
+        f"{path}: {counted(count, 'line is', 'lines are')} left to decide. Next: hybrid-mpc check {' '.join(words)}"
+    )
     for line in lines:
         print(printable(line))

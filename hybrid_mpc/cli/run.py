@@ -18,7 +18,7 @@ from hybrid_mpc.cli.options import (
     Scheduler,
     TimeColumn,
 )
-from hybrid_mpc.rules import MOST_SEED
+from hybrid_mpc.rules import MOST_SEED, counted
 
 if TYPE_CHECKING:
     from hybrid_mpc.compare.sequential import Comparison
@@ -228,7 +228,7 @@ def watch_lines(found: WatchResult | Absent) -> list[str]:
     limits = found.limits
     lines = [
         f"monitor of {found.kind}: learned from {60 * limits.hours:.1f} min for {limits.false_alarms_per_hour:g} false "
-        f"alarms per hour; {len(found.alarms)} alarms on recordings"
+        f"alarms per hour; {counted(len(found.alarms), 'alarm')} on recordings"
     ]
     for row in found.faults or ():
         seen = "not detected" if row.delay_s is None else f"detected after {row.delay_s:.3g} s"

@@ -67,6 +67,19 @@ def test_a_decimal_comma_that_is_read_is_a_note_and_no_warning(call, machine, tm
     assert "decimal comma" not in told.partition(" warning")[2]
 
 
+def test_what_is_marked_is_counted_at_the_end(call, machine, tmp_path):
+    text = (machine / "my_machine.py").read_text()
+    for marks in (1, 2):
+        (tmp_path / "marked.py").write_text(text + "# TODO: decide this\n" * marks)
+        code, told = checked(call, tmp_path / "marked.py", "--data", machine / "monday.csv")
+        assert code == 0
+        last = told.rpartition("No errors")[2]
+        assert f"{marks} value" in last
+        assert "TODO" in last
+        assert f"{marks} left to decide" in told
+    assert "1 errors" not in told
+
+
 @pytest.mark.full
 def test_a_machine_in_casadi_is_checked_without_torch(machine):
     words = ["check", str(machine / "my_machine.py"), "--data", str(machine / "monday.csv")]

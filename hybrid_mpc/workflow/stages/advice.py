@@ -9,6 +9,7 @@ from hybrid_mpc.compare.sequential import hardest
 from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
+from hybrid_mpc.rules import counted
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.compare import REPORTED, closed_loops
 from hybrid_mpc.workflow.stages.promises import STRUCTURE
@@ -72,7 +73,7 @@ def doubt_of(in_doubt: Sequence[str]) -> str:
     if not in_doubt:
         return ""
     n = len(in_doubt) - 1
-    more = f" (and {n} more reason{'s' * (n > 1)})" if n else ""
+    more = f" (and {counted(n, 'more reason')})" if n else ""
     return f"The structure of the prior is in doubt: {in_doubt[0]}{more}."
 
 

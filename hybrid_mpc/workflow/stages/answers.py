@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Answer, Verdict
+from hybrid_mpc.rules import counted
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.advice import EXPLAINED
 from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, closed_loops
@@ -44,7 +45,11 @@ def model_answer(results: Results) -> Answer:
     labels = list(own.rmse)
     lines += [_error_line(results, name, label) for label in labels[:SHOWN_OUTPUTS]]
     if more := len(labels) - SHOWN_OUTPUTS:
-        lines += [f"{more} more outputs are in section Free runs."] if more > 0 else []
+        lines += (
+            [f"{counted(more, 'more output is', 'more outputs are')} in section Free runs."]
+            if more > 0
+            else []
+        )
     hybrid = choice.candidates[choice.hybrid]
     if name == "phy" or not (math.isfinite(hybrid.ratio) and math.isfinite(hybrid.upper)):
         lines.append(f"{choice.reason.rstrip('.').capitalize()}.")
@@ -135,7 +140,7 @@ def _time_lines(found: ControlResult | Absent) -> Iterator[tuple[str, bool]]:
     if isinstance(found, Absent):
         return
     ms = found.step_ms
-    late = f"{ms.misses} steps missed the deadline" if ms.misses else "No step missed its deadline"
+    late = f"{counted(ms.misses, 'step')} missed the deadline" if ms.misses else "No step missed its deadline"
     yield (
         f"{late}: 99 % of the steps take less than {ms.p99:.3g} ms; the period is {ms.period:g} ms.",
         ms.misses > 0,

@@ -19,6 +19,7 @@ from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
+from hybrid_mpc.rules import counted
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
@@ -321,7 +322,7 @@ def _data_table(data: DataResult) -> Table:
         (f"cut: {c.file}, {c.start_s:.2f} to {c.end_s:.2f} s: {c.why}", c.end_s - c.start_s)
         for c in data.cuts
     ]
-    caption = f"{len(data.files)} files; content hash {data.hash[:16]}."
+    caption = f"{counted(len(data.files), 'file')}; content hash {data.hash[:16]}."
     return Table(("part", "length [s]"), rows, caption)
 
 

@@ -20,6 +20,7 @@ from hybrid_mpc.kit.assembly import sensor_steps
 from hybrid_mpc.kit.parts import WatchFile, read_parts, write_watch
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import beside
+from hybrid_mpc.rules import counted
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
 from hybrid_mpc.watch.explain import begun, explained
@@ -377,7 +378,7 @@ def _loop_data(context: Context) -> Data:
         for name in ("y", "u"):
             content.update(np.ascontiguousarray(row.arrays[name], dtype="<f8").tobytes())
     minutes = sum(row.seconds for row in loops) / 60
-    source = f"{len(loops)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
+    source = f"{counted(len(loops), 'loop')} of the simulated machine under the hybrid MPC, {minutes:.1f} min"
     masks = [np.ones(len(r.t), dtype=bool) for r in records]
     return Data(records, masks, source, content.hexdigest(), tuple(loops))
 
