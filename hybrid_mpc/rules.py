@@ -136,6 +136,16 @@ def counted(count: int, noun: str, plural: str = "") -> str:
     return f"{count} {noun if count == 1 else plural or noun + 's'}"
 
 
+def two_digits(value: float) -> str:
+    """A number with two significant digits, without an exponent where it has few digits.
+
+    Example:
+        >>> two_digits(0.0277778), two_digits(10.4167), two_digits(2.0), two_digits(170.2)
+        ('0.028', '10', '2', '170')
+    """
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def markdown(text: str) -> str:
     """Any text for Markdown and cells of its tables: one line, special characters as numeric entities.
 

@@ -199,7 +199,8 @@ def _loops(results: Results) -> Iterator[Hint]:
     ms = None if isinstance(results.control, Absent) else results.control.step_ms
     if ms is not None and ms.p99 > ms.period:
         yield Hint(
-            "bad", f"Controller step time: the 99th percentile is {ms.p99:.3g} ms, but the period is {ms.period:g} ms.",
+            "bad", f"Controller step time: the 99th percentile is {ms.p99:.3g} ms of wall time, but the period "
+            f"is {ms.period:g} ms.",
             "Measure again on an idle computer. Else use the solver native (compiled C), a shorter horizon or a "
             "longer dt.",
         )  # fmt: skip

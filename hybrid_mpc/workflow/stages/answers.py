@@ -90,11 +90,11 @@ def controller_answer(results: Results) -> Answer:
         lines.append(one)
         bad |= wrong
     rows = () if isinstance(results.promises, Absent) else results.promises.rows
-    lines += [
-        f"Stability margins: {row.evidence}."
-        for row in rows
-        if row.name == "stability margins" and row.evidence
-    ]
+    for name, title in (
+        ("step time", "Step time under constant loads"),
+        ("stability margins", "Stability margins"),
+    ):
+        lines += [f"{title}: {row.evidence}." for row in rows if row.name == name and row.evidence]
     open_ = [row for row in rows if row.verdict != "shown"]
     if rows:
         lines.append(_promise_line(rows, open_))
@@ -140,9 +140,11 @@ def _time_lines(found: ControlResult | Absent) -> Iterator[tuple[str, bool]]:
     if isinstance(found, Absent):
         return
     ms = found.step_ms
+    where = "of the tasks' loops" if found.rows else "on recordings"
     late = f"{counted(ms.misses, 'step')} missed the deadline" if ms.misses else "No step missed its deadline"
     yield (
-        f"{late}: 99 % of the steps take less than {ms.p99:.3g} ms; the period is {ms.period:g} ms.",
+        f"{late}: 99 % of the steps {where} take less than {ms.p99:.3g} ms of wall time; the period is "
+        f"{ms.period:g} ms.",
         ms.misses > 0,
     )
 
@@ -155,6 +157,9 @@ def monitor_answer(found: WatchResult | Absent) -> Answer:
     clean, wanted = found.clean, found.limits.false_alarms_per_hour
     many = clean.too_many(wanted)
     lines = [f"False alarms: {clean.words(wanted)}."]
+    if not found.limits.rated:
+        words = found.limits.words
+        lines = [f"False alarms: {clean.alarms} in {clean.seconds:.0f} s of undisturbed data; {words}."]
     faults = found.faults or ()
     seen = [row.delay_s for row in faults if row.delay_s is not None]
     if faults:

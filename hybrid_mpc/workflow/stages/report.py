@@ -19,7 +19,7 @@ from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
-from hybrid_mpc.rules import counted
+from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
@@ -277,13 +277,15 @@ def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
         return (f"The monitor was not examined: {found.reason.rstrip('.')}.",)
     limits, clean = found.limits, found.clean
     rate, wanted = limits.false_alarms_per_hour, RATES[0] / limits.time_unit
-    learned = f"Limits were learned from {found.sources[found.kind]}, for {rate:g} false alarms an hour."
+    learned = f"Limits were learned from {found.sources[found.kind]}: {limits.words}."
     if not limits.rated:
-        learned = f"Limits are {limits.method}; they were learned from {found.sources[found.kind]}."
+        learned = (
+            f"Limits are {limits.method}; they were learned from {found.sources[found.kind]}: {limits.words}."
+        )
     elif rate > wanted:
         learned += (
-            f" Nominal data are too short for {wanted:g} an hour. Use a longer run (budget full), or recordings of the "
-            f"machine with hybrid-mpc monitor --learn {wanted:g}."
+            f" Nominal data are too short for {two_digits(wanted)} an hour. Use a longer run (budget full), or "
+            f"recordings of the machine with hybrid-mpc monitor --learn {two_digits(wanted)}."
         )
     verdict = "too many for these limits" if clean.too_many(rate) else "consistent with these limits"
     test = f"Alarms in the {clean.test_seconds:.0f} s of test data among them: {clean.test_alarms}."
@@ -581,7 +583,10 @@ def _observer_table(found: EstimationResult) -> Table:
 
 def _timing_table(ms: StepTimes) -> Table:
     row = (ms.median, ms.p95, ms.p99, ms.max, ms.period, ms.misses)
-    return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
+    caption = "Wall time of whole steps. The promise of the step time is about processor time."
+    return Table(
+        ("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,), caption
+    )
 
 
 def _watch_tables(found: WatchResult) -> list[Table]:
