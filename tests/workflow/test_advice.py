@@ -144,6 +144,15 @@ def test_doubt_about_the_prior_comes_first_and_is_told_once(results):
         ]  # fmt: skip
 
 
+def test_noise_that_is_declared_smaller_than_estimated_leaves_room_for_a_better_model(results):
+    (error,) = results.evaluation.scores[results.choice.choice.recommended].model.rmse.values()
+    found = prior(results, fit=replace(results.prior.fit, sigma=(error / 1.1,)))
+    for declared, verdict in ((error / 3.7, "plain"), (error / 1.2, "good"), (error, "good")):
+        (hint,) = [one for one in advice(found, declared=(declared,)) if "sensor noise" in one.finding]
+        assert hint.verdict == verdict
+        assert ("no better model" in hint.remedy) == (verdict == "good")
+
+
 def test_an_error_that_is_the_sensor_s_noise_is_told(results):
     (error,) = results.evaluation.scores[results.choice.choice.recommended].model.rmse.values()
     said = {

@@ -26,19 +26,20 @@ MOST = 4
 """Largest number of warnings of one kind among the hints; the report's sections list all."""
 
 
-def advice(results: Results, *, explained: bool = False) -> list[Hint]:
+def advice(results: Results, *, explained: bool = False, declared: Sequence[float] = ()) -> list[Hint]:
     """Hints about a finished run: problems first; without a problem, the next step.
 
     Args:
         results: The run's results.
         explained: Whether the run has searched for missing terms. Default: False; a hint may then name the command.
+        declared: Standard deviations of the sensors' errors that the scenario declares. Default: unknown.
 
     Example:
         ``[hint.finding for hint in advice(read_results(path)) if hint.verdict == "bad"]``
     """
     found = [
         *_doubt(results), *_recordings(results), *_prior(results, explained), *_choice(results, explained),
-        *_linear(results), *_floor(results), *_bands(results), *_promises(results), *_loops(results),
+        *_linear(results), *_floor(results, declared), *_bands(results), *_promises(results), *_loops(results),
         *_watching(results),
     ]  # fmt: skip
     if closed_loops(results.control) is not None and not any(hint.verdict == "bad" for hint in found):
@@ -152,16 +153,27 @@ def _linear(results: Results) -> Iterator[Hint]:
         )  # fmt: skip
 
 
-def _floor(results: Results) -> Iterator[Hint]:
-    """Outputs whose free-run error is about the sensor noise."""
+def _floor(results: Results, declared: Sequence[float]) -> Iterator[Hint]:
+    """Outputs whose free-run error is about the sensor noise: the smaller one of the declared and the estimated."""
     errors = results.evaluation.scores[results.choice.choice.recommended].model.rmse
-    for (label, error), noise in zip(errors.items(), results.prior.fit.sigma, strict=True):
+    estimated = results.prior.fit.sigma
+    given = declared if len(declared) == len(estimated) else estimated
+    for (label, error), noise, own in zip(errors.items(), estimated, given, strict=True):
         name, _, unit = label.partition(" [")
-        if error < FLOOR * noise:
+        if not error < FLOOR * noise:
+            continue
+        said = f"The free-run error of {name} is {error:.2g} {unit.rstrip(']')}: {error / noise:.1f} times its sensor "
+        if error < FLOOR * min(noise, own):
             yield Hint(
-                "good", f"The free-run error of {name} is {error:.2g} {unit.rstrip(']')}: {error / noise:.1f} times "
-                "its sensor noise as estimated by the fit.",
+                "good", f"{said}noise as estimated by the fit.",
                 "These recordings allow no better model. Use a better sensor, or excite the machine more.",
+            )  # fmt: skip
+        else:
+            yield Hint(
+                "plain", f"{said}noise as estimated by the fit, but {error / own:.1f} times the declared noise "
+                f"({own:.2g}).",
+                "Look at the sensor at rest: either sensor_sigma is too small, or the prior lacks an effect that the "
+                "fit takes for noise.",
             )  # fmt: skip
 
 

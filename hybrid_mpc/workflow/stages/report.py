@@ -182,7 +182,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         (),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
-        advice(results, explained=_explained(context)),
+        advice(results, explained=_explained(context), declared=context.scenario.sensor_sigma),
         doubt_of(results.prior.in_doubt),
         answer_all(results),
     )
