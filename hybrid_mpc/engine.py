@@ -20,6 +20,7 @@ from queue import Empty, Queue
 from typing import Any, Generic, TypeVar
 
 from hybrid_mpc.errors import InputError, named_extra, no_exit
+from hybrid_mpc.rules import counted
 
 WORKERS = min(2, os.cpu_count() or 1)
 """Number of parallel processes: at most two, the cores of the reference machine."""
@@ -52,6 +53,9 @@ class Progress:
 
     def warn(self, text: str) -> None:
         """A warning that does not stop the job."""
+
+    def note(self, text: str) -> None:
+        """A remark that asks for nothing, e.g. how a file was read."""
 
     def finish(self, text: str) -> None:
         """The stage has ended."""
@@ -209,7 +213,7 @@ class DaskEngine(Engine[B, R]):
         except BaseException:
             self.close()
             raise
-        self.workers, self.name = len(self._seen), f"dask, {len(self._seen)} workers"
+        self.workers, self.name = len(self._seen), f"dask, {counted(len(self._seen), 'worker')}"
         self._looked = self._manned = time.monotonic()
 
     @property

@@ -126,6 +126,26 @@ def printable(text: str) -> str:
     return "".join(c if _printed(c) or c in "\n\t" else repr(c)[1:-1] for c in text)
 
 
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """A count with its noun; ``plural`` if it is not the noun and an s.
+
+    Example:
+        >>> counted(1, "error"), counted(2, "warning"), counted(0, "recording"), counted(2, "try", "tries")
+        ('1 error', '2 warnings', '0 recordings', '2 tries')
+    """
+    return f"{count} {noun if count == 1 else plural or noun + 's'}"
+
+
+def two_digits(value: float) -> str:
+    """A number with two significant digits, without an exponent where it has few digits.
+
+    Example:
+        >>> two_digits(0.0277778), two_digits(10.4167), two_digits(2.0), two_digits(170.2)
+        ('0.028', '10', '2', '170')
+    """
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def markdown(text: str) -> str:
     """Any text for Markdown and cells of its tables: one line, special characters as numeric entities.
 

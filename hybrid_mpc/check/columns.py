@@ -20,7 +20,7 @@ from hybrid_mpc.data.source import Columns, Source, name_and_unit
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.records import shown
-from hybrid_mpc.rules import LARGEST, column_problem
+from hybrid_mpc.rules import LARGEST, column_problem, counted
 
 Array = NDArray[np.float64]
 MOST_RECORDED = 1e-3 * LARGEST
@@ -40,6 +40,15 @@ EPOCHS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3), (1e9, 1.0))
 """Smallest time since 1970 (in the year 2001) in each unit [s]; a number five times larger (after 2130) is no epoch."""
 UNIT = re.compile(r"[\w/^*·.%°²³µμΩ() -]{1,20}")
 """Pattern of a unit; any other text behind a name is not one."""
+LIMITS: Mapping[str, Sequence[float]] = {
+    "%": (-100.0, 0.0, 100.0),
+    "V": (-24.0, -12.0, -10.0, -5.0, 0.0, 5.0, 10.0, 12.0, 24.0),
+    "mA": (0.0, 4.0, 20.0),
+    "": (-1.0, 0.0, 1.0),
+}
+"""Usual limits of actuators, by unit (empty: no unit)."""
+AT_LIMIT = 2e-3
+"""Largest distance of a recorded end from such a limit, in spans."""
 DIVERGED, AGAIN = 1e12, 3
 """Least size of diverged numbers, over a column's median size; and the fewest such numbers."""
 
@@ -90,6 +99,30 @@ class Column:
             float(near(high + span, span / 20)),
         )
 
+    @property
+    def limits(self) -> tuple[float | None, float | None]:
+        """Ends of the recorded range that look like limits of an actuator, None where an end does not: 0 to 100 %.
+
+        An end at exactly zero is one in any unit.
+        """
+        low, high = self.span
+        near_by = AT_LIMIT * (high - low)
+        usual = LIMITS.get("" if self.unit in ("", "-", "1") else self.unit, ())
+        below = [0.0] if low == 0.0 else [end for end in usual if 0 <= low - end <= near_by]
+        above = [0.0] if high == 0.0 else [end for end in usual if 0 <= end - high <= near_by]
+        return below[0] if below else None, above[0] if above else None
+
+    @property
+    def input_signal(self) -> Signal:
+        """The signal of an input: its range ends at recorded limits of the actuator."""
+        low, high = self.limits
+        one = self.signal
+        if one.periodic:
+            return one
+        return replace(
+            one, lower=one.lower if low is None else low, upper=one.upper if high is None else high
+        )
+
 
 def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, str]]:
     """Columns whose numbers move, and the reasons why others are no signals, by full name."""
@@ -112,7 +145,9 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
             if full in one.faults:
                 problems.append(f"{one.faults[full]}{where}")
             elif rows and len(one.values) not in (1, rows):
-                problems.append(f"it has {len(one.values)} values{where}, but the other columns have {rows}")
+                problems.append(
+                    f"it has {counted(len(one.values), 'value')}{where}, but the other columns have {rows}"
+                )
             elif (k := _diverges(pieces[-1])) is not None:
                 diverged.append(
                     f"{source.path}: {one.place(k)}, column {shown(full)}: grows to "
@@ -127,7 +162,7 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
         elif not len(known):
             left_out[full] = "it has no number"
         elif len(known) < FEWEST or max(map(len, pieces)) == 1:
-            left_out[full] = f"it has {len(known)} number{'s' * (len(known) > 1)}, fewer than {FEWEST}"
+            left_out[full] = f"it has {counted(len(known), 'number')}, fewer than {FEWEST}"
         elif known.min() == known.max():
             left_out[full] = f"it is constant at {known[0]:g}"
         elif np.abs(known).max() > MOST_RECORDED:
@@ -221,13 +256,17 @@ def read_all(source: Source) -> tuple[dict[str, Columns], dict[str, str]]:
 
 
 class Clock(NamedTuple):
-    """The time: its column (None: only a sampling period), period, unit of the column and length [s], and a doubt."""
+    """The time: its column (None: only a sampling period), period, unit of the column and length [s], and a doubt.
+
+    ``periods`` [s] are those of the recordings, in their order; ``period`` is the longest.
+    """
 
     column: Column | None
     period: float
     seconds: float = 1.0
     doubt: str = ""
     length: float = 0.0
+    periods: tuple[float, ...] = ()
 
 
 def clock_of(
@@ -245,7 +284,7 @@ def clock_of(
     first = _time(sources[0], columns, left_out, asked, chosen)
     rows = next(iter(columns.values())).lengths
     if first.column is None:
-        return first._replace(length=first.period * min(rows))
+        return first._replace(length=first.period * min(rows), periods=(first.period,) * len(rows))
     full, clocks, problems = first.column.full, list[Clock](), list[str]()
     for source in sources:
         clock = (
@@ -266,7 +305,8 @@ def clock_of(
         else clock.seconds * float(np.ptp(clock.column.values))
         for clock, m in zip(clocks, rows, strict=True)
     ]
-    return first._replace(period=max(clock.period for clock in clocks), length=min(lengths))
+    periods = tuple(clock.period for clock in clocks)
+    return first._replace(period=max(periods), length=min(lengths), periods=periods)
 
 
 def _time(

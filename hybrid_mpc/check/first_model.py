@@ -27,6 +27,8 @@ STRIDES = (1, 4, 16)
 """Distances [samples] of the predictions from which a growth rate is estimated."""
 SHOWN = 10.0
 """Least length of a recording over a time constant that it identifies: any input explains a few slow motions."""
+FAR = 5.0
+"""Least steady-state effect of all inputs, over the output's span, of an output that integrates."""
 LAGS = 4
 """Past samples from which outputs are predicted."""
 ROWS = 10_000
@@ -57,6 +59,7 @@ class Lag:
     ``states`` is 1 or 2: ``T y' = k u + c - y`` or ``T^2 y'' + 2 D T y' = k u + c - y``, with time constant ``seconds``
     (T) [s], ``damping`` (D), ``gains`` (k) and ``offset`` (c). ``share`` is the part of the output's variance that its
     free run explains. ``reach`` is the steady-state effect of all inputs over their ranges, over the output's span.
+    ``driven``: an input affects the output.
     """
 
     states: int
@@ -66,6 +69,7 @@ class Lag:
     offset: float
     share: float = 0.0
     reach: float = 1.0
+    driven: bool = True
 
     @property
     def matters(self) -> float:
@@ -81,6 +85,16 @@ class Lag:
         slow = self.seconds * (self.damping + math.sqrt(self.damping**2 - 1))
         reach = max(self.reach, 1.0)
         return max(slow / reach, self.seconds / math.sqrt(reach))
+
+    def integrates(self, length: float) -> bool:
+        """Whether the output integrates, as far as recordings of this length [s] show it.
+
+        Its slowest time constant is longer than a recording identifies, and inputs would move it far beyond its span.
+        """
+        slow = self.seconds
+        if self.states == 2:
+            slow *= self.damping + math.sqrt(self.damping**2 - 1) if self.damping > 1 else 0.0
+        return self.driven and self.share >= MATTERS and self.reach >= FAR and slow > length / SHOWN
 
 
 def first_lag(runs: Sequence[Runs], output: int, dt: float, inputs: int) -> Lag:
@@ -220,11 +234,13 @@ def slowest(lags: Sequence[Lag], length: float) -> tuple[float, int]:
     """The slowest time constant [s] that matters, and the output's index.
 
     A time constant counts if inputs explain a part of the output by it, and the recording is ``SHOWN`` times longer.
-    If none counts, the result is at most that part of the recording.
+    If none counts, the result is at most that part of the recording. An output that no input affects counts only where
+    there is no other one.
     """
     longest = length / SHOWN
-    good = [i for i, lag in enumerate(lags) if lag.share >= MATTERS and lag.matters <= longest]
-    best = max(good or range(len(lags)), key=lambda i: lags[i].matters)
+    driven = [i for i, lag in enumerate(lags) if lag.driven] or list(range(len(lags)))
+    good = [i for i in driven if lags[i].share >= MATTERS and lags[i].matters <= longest]
+    best = max(good or driven, key=lambda i: lags[i].matters)
     return min(lags[best].matters, longest), best
 
 

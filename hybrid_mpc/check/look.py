@@ -17,6 +17,7 @@ from hybrid_mpc.data.names import FIELD, said_by, unit_behind
 from hybrid_mpc.data.source import Source, name_and_unit, restarts
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.records import shown
+from hybrid_mpc.rules import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,12 +137,15 @@ def _odd(full: str, values: Array) -> list[str]:
     """Findings about numbers of a column that may be wrong."""
     if (code := missing_code(values)) is not None:
         count = int((values == code).sum())
-        rows = f"{count} row{'s' * (count > 1)}"
+        rows = counted(count, "row")
         return [
             f"column {shown(full)}: {code:.10g} in {rows} is far from all others; probably a code for missing values"
         ]
     if (odd := outliers(values)) is not None:
-        return [f"column {shown(full)}: {len(odd)} values are far from all others, e.g. {values[odd[0]]:.6g}"]
+        return [
+            f"column {shown(full)}: {counted(len(odd), 'value is', 'values are')} far from all others, "
+            f"e.g. {values[odd[0]]:.6g}"
+        ]
     return []
 
 

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.check.columns import COUNTED, Column, ascii_of, clock_of, columns_of, near, no_signal
 from hybrid_mpc.check.first_model import CLOSED, Lag, Runs, feedback_of, first_lag, growth_of, slowest
-from hybrid_mpc.check.roles import Kind, Trait, Verdict, judge_roles
+from hybrid_mpc.check.roles import Kind, Trait, Verdict, driven, judge_roles
 from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.files import opened
 from hybrid_mpc.data.names import ANGLES
 from hybrid_mpc.data.recording import MIN_SCORED, read_recordings
+from hybrid_mpc.data.scales import noise_of, robust_spread
 from hybrid_mpc.data.source import Source, name_and_unit
 from hybrid_mpc.data.trajectories import load_trajectories
 from hybrid_mpc.errors import InputError, refuse
@@ -35,6 +36,12 @@ ACTING = "If they act on the machine instead: new ... --disturbance-column NAME"
 """Remedy for a measured column that is no output."""
 SMOOTHED = 7
 """Fewest sampling periods of smoothing: a polynomial of order 4 needs six samples, and stamps are rounded."""
+GUESSED = 0.005
+"""Guessed error of a sensor whose noise the recordings do not show, in spans of the output."""
+WHITE = 0.6
+"""Least noise found by fourth differences, over that by third ones, that is noise and no motion."""
+INTEGRATES = "the recordings are too short to show a steady state"
+"""Remark on the rate of an output that integrates."""
 HORIZONS = 20, 100
 """Shortest and longest proposed horizon [periods]."""
 KINDS: Mapping[Kind, str] = {
@@ -57,7 +64,8 @@ class Draft:
     ``disturbances`` are measured, act on the machine and are not commanded. ``verdicts`` give the reason of each role.
     ``loop`` describes the evidence of a closed loop, empty without one; ``growth`` [1/s] is the rate at which the
     machine diverges from its steady state, zero if it does not. ``lags`` are first models of the outputs. ``length`` is
-    that of the shortest recording [s]. ``notes`` say by file how it was read.
+    that of the shortest recording [s]. ``notes`` say by file how it was read. ``periods`` [s] are those of the
+    recordings, in their order.
     """
 
     time: Column | None
@@ -75,6 +83,14 @@ class Draft:
     length: float = 0.0
     lags: tuple[Lag, ...] = ()
     notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    periods: tuple[float, ...] = ()
+
+    @property
+    def sampling(self) -> str:
+        """The sampling periods in words, each once: ``0.01 s, 0.02 s; the longest is the model's period``."""
+        each = [f"{period:.4g} s" for period in sorted(self.periods or (self.period,))]
+        each = list(dict.fromkeys(each))
+        return ", ".join(each) + ("; the longest is the model's period" if len(each) > 1 else "")
 
     @property
     def unsure(self) -> dict[str, str]:
@@ -83,9 +99,34 @@ class Draft:
 
     @property
     def runs(self) -> tuple[Runs, ...]:
-        """Outputs, and all inputs and disturbances, of each recording."""
+        """Outputs, and all inputs and disturbances, of each recording, at the longest sampling period of all.
+
+        A recording that is sampled faster has the inputs' means until the next sample.
+        """
         y, u = (list(zip(*(c.pieces for c in group), strict=True)) for group in (self.outputs, self.drives))
-        return tuple(Runs(np.column_stack(a), np.column_stack(b)) for a, b in zip(y, u, strict=True))
+        runs = [Runs(np.column_stack(a), np.column_stack(b)) for a, b in zip(y, u, strict=True)]
+        periods = self.periods or (self.period,) * len(runs)
+        return tuple(_thinned(run, round(self.period / p)) for run, p in zip(runs, periods, strict=True))
+
+    @property
+    def sensor_sigma(self) -> tuple[tuple[float, bool], ...]:
+        """Standard deviation of each sensor's error, and whether the recordings show it; else it is a guess.
+
+        Noise is what remains after three differences, and a sensor's smallest step over ``sqrt(12)`` at least. It shows
+        where a fourth difference finds (nearly) as much: a motion within three samples becomes smaller by each.
+        """
+        found = []
+        for column in self.outputs:
+            pieces = column.pieces
+            sigma = float(noise_of([Runs(piece[:, None], piece[:, None]) for piece in pieces])[0])
+            fourth = robust_spread(np.concatenate([np.diff(piece, 4) for piece in pieces])) / np.sqrt(70.0)
+            known = column.values[np.isfinite(column.values)]
+            step = float(np.diff(np.unique(known)).min(initial=np.inf)) / np.sqrt(12.0)
+            guess = GUESSED * float(np.ptp(column.span))
+            shown_there = sigma > 0 and fourth > WHITE * sigma and guess > 0
+            bound = min(sigma, guess) if sigma > 0 else guess
+            found.append((max(sigma, step) if shown_there else bound, shown_there))
+        return tuple(found)
 
     @property
     def drives(self) -> tuple[Column, ...]:
@@ -130,7 +171,8 @@ class Roles:
     def of(cls, draft: Draft, names: Sequence[str] = (), speeds: Sequence[Signal] = ()) -> Roles:
         """Signals of a draft; ``names`` of the outputs (default: their own), ``speeds`` of some of them."""
         inputs, outputs, disturbances = (
-            tuple(c.signal for c in group) for group in (draft.inputs, draft.outputs, draft.disturbances)
+            tuple(c.input_signal if group is draft.inputs else c.signal for c in group)
+            for group in (draft.inputs, draft.outputs, draft.disturbances)
         )
         if names:
             outputs = tuple(replace(s, name=name) for s, name in zip(outputs, names, strict=True))
@@ -260,6 +302,7 @@ def draft_scenario(
             set_points=roles["set-point"],
             verdicts=verdicts,
             length=clock.length,
+            periods=clock.periods,
         )
         draft = _unwrap([one.path for one in sources], draft)
         still = [full for full in _at_rest([one.path for one in sources], draft) if full not in kinds]
@@ -270,9 +313,26 @@ def draft_scenario(
     used = {c.full for c in (*draft.signals, *draft.set_points)}
     left_out |= {c.full: verdicts[c.full].reason for c in free if c.full not in used}
     runs = draft.runs
-    lags = [first_lag(runs, i, draft.period, len(draft.inputs)) for i in range(len(draft.outputs))]
+    acting = [Trait(c.full, c.unit, c.pieces) for c in draft.inputs]
+    lags = [
+        replace(
+            first_lag(runs, i, draft.period, len(draft.inputs)),
+            driven=driven(Trait(c.full, c.unit, c.pieces), acting),
+        )
+        for i, c in enumerate(draft.outputs)
+    ]
     notes = {one.path.name: one.notes for one in sources if one.notes}
     return _in_loop(replace(draft, left_out=left_out, lags=tuple(lags), notes=notes))
+
+
+def _thinned(run: Runs, stride: int) -> Runs:
+    """A recording at every ``stride``-th sample, with the inputs' means until the next."""
+    rows = len(run.y) // stride
+    if stride <= 1 or rows < 2:
+        return run
+    return Runs(
+        run.y[: stride * rows : stride], run.u[: stride * rows].reshape(rows, stride, -1).mean(axis=1)
+    )
 
 
 def _left_to_user(
@@ -378,14 +438,16 @@ def _rounded(value: float, digits: int = 3) -> str:
     return f"{float(f'{value:.{digits}g}') + 0.0!r}"
 
 
-def _signal(column: Column, name: str) -> tuple[str, str]:
-    """A Signal as source text, and the comment behind it."""
+def _signal(column: Column, name: str, *, acts: bool = False) -> tuple[str, str]:
+    """A Signal as source text, and the comment behind it; ``acts``: it is an input."""
     low, high = column.span
     recorded = f"recorded: {near(low, (high - low) / 2000)} to {near(high, (high - low) / 2000)}"
     unit = f"unit from the header; {recorded}" if column.unit else f"{MARK}: give its unit; {recorded}"
     if column.asked:
         unit = f"{MARK}: check the unit, taken from the last letter of the name; {recorded}"
-    signal = column.signal
+    signal = column.input_signal if acts else column.signal
+    if acts and not column.periodic and None in column.limits:
+        unit = f"{'' if unit.startswith(MARK) else f'{MARK}: '}{unit}. Give the limits of the actuator"
     ends = "periodic=True" if column.periodic else f"{signal.lower!r}, {signal.upper!r}"
     return f"Signal({_text(name)}, {_text(column.unit or '-')}, {ends})", unit
 
@@ -407,6 +469,16 @@ def _unused(name: str, taken: Iterable[str]) -> str:
     return name
 
 
+def _speed_of(name: str, column: Column, lag: Lag, period: float, taken: Iterable[str]) -> tuple[str, Signal]:
+    """Name and signal of the second state of an output, its speed."""
+    steps = np.diff(column.values) / period
+    rms = float(np.sqrt(np.nanmean(steps**2))) if np.isfinite(steps).any() else 0.0
+    # speeds with a larger rms are refused later: differentiated sensor noise must stay within
+    fast = float(_rounded(max(10 * float(np.ptp(column.span)) / lag.seconds, 3 * rms), 2))
+    speed = _unused(f"{name}_rate", taken)
+    return speed, Signal(speed, per_second(column.unit or "-"), -fast, fast)
+
+
 def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
     """The text of the file: signals, a first prior of lags, and the DataSpec.
 
@@ -421,7 +493,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
     kind = f"Machine{kind}" if kind[0].isdigit() or keyword.iskeyword(kind) or kind in USED else kind
     rates, parameters, steady = [], list[tuple[str, float, str, float, float, str]](), list[str]()
     gains, offsets = list[list[float]](), list[float]()
-    taken, lag_names = set[str](), list[tuple[str, str]]()
+    taken, second = set[str](), dict[str, tuple[str, str]]()  # rates of second states by output
 
     def parameter(name: str, value: float, unit: str, low: float, high: float, text: str) -> str:
         name = _unused(name, taken)
@@ -441,6 +513,49 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         middle = min(max(lag.offset + made, low), high) - made
         low, high = min(low, low - made, middle), max(high, high - made, middle)
         rest = near(low, span / 20), near(middle, span / 500), near(high, span / 20)
+        if lag.integrates(draft.length):
+            # T y' = k u + c - y, where y stays near its median: y' = (k u + c - median) / T
+            inner = lag.seconds if lag.states == 1 else 2 * lag.damping * lag.seconds
+            pull = (lag.offset - float(np.nanmedian(column.values))) / inner
+            pushes = [gain / inner for gain in lag.gains]
+            sizes = [float(np.ptp(c.span)) for c in draft.drives]
+            most = 10 * max(
+                abs(pull), span / draft.length, *(abs(k * s) for k, s in zip(pushes, sizes, strict=True))
+            )
+            unit = per_second(unit)
+            drift = parameter(
+                f"drift_{name}", float(_rounded(pull)), unit, -float(_rounded(most)), float(_rounded(most)),
+                "rate without inputs",
+            )  # fmt: skip
+            written = [drift]
+            offsets.append(parameters[-1][1])
+            gains.append([])
+            for (kind_of, drive), source, push, size in zip(drives, draft.drives, pushes, sizes, strict=True):
+                per, reach = f"{unit}/({source.unit or '-'})", float(_rounded(min(most / size, LARGEST)))
+                k = parameter(
+                    f"k_{name}_{drive}", float(_rounded(push, 4)), per, -reach, reach, f"rate per {drive}"
+                )
+                written.append(f"{k} * {kind_of}.{drive}")
+                gains[-1].append(parameters[-1][1])
+            steady.append(f"{name}_moves = {' + '.join(written)}")
+            if lag.states == 1:
+                rates.append((f"{name}_moves", f"integrates: {INTEGRATES}"))
+                continue
+            late = float(_rounded(lag.seconds / (2 * lag.damping)))
+            constant = parameter(
+                f"T_{name}",
+                late,
+                "s",
+                float(_rounded(late / 20)),
+                float(_rounded(late * 20)),
+                "time constant",
+            )
+            second[name] = f"({name}_moves - x.{{}}) / {constant}", f"{name} integrates: {INTEGRATES}"
+            speeds[name] = _speed_of(
+                name, column, lag, draft.period, {*y_names, *(one for one, _ in speeds.values())}
+            )
+            rates.append((f"x.{speeds[name][0]}", f"exact: the derivative of {name}"))
+            continue
         seconds = float(_rounded(lag.seconds))
         constant = parameter(
             f"T_{name}",
@@ -454,7 +569,6 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         if lag.states == 2:
             bounded = float(_rounded(min(max(lag.damping, 0.01), 5.0)))
             damping = parameter(f"D_{name}", bounded, "-", 0.0, 10.0, "damping")
-        lag_names.append((constant, damping))
         low, middle, high = map(float, rest)
         towards = [parameter(f"rest_{name}", middle, unit, low, high, "value without inputs")]
         offsets.append(parameters[-1][1])
@@ -472,21 +586,17 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         if lag.states == 1:
             rates.append((f"({name}_steady - x.{name}) / {constant}", "first-order lag"))
             continue
-        steps = np.diff(column.values) / draft.period
-        rms = float(np.sqrt(np.nanmean(steps**2))) if np.isfinite(steps).any() else 0.0
-        # speeds with a larger rms are refused later: differentiated sensor noise must stay within
-        fast = float(_rounded(max(10 * span / lag.seconds, 3 * rms), 2))
-        speed = _unused(f"{name}_rate", {*y_names, *(one for one, _ in speeds.values())})
-        speeds[name] = speed, Signal(speed, per_second(unit), -fast, fast)
-        rates.append((f"x.{speed}", f"exact: the derivative of {name}"))
+        pull_text = f"({name}_steady - x.{name}) / {constant}**2 - 2 * {damping} / {constant} * x.{{}}"
+        second[name] = pull_text, "second-order lag"
+        speeds[name] = _speed_of(
+            name, column, lag, draft.period, {*y_names, *(one for one, _ in speeds.values())}
+        )
+        rates.append((f"x.{speeds[name][0]}", f"exact: the derivative of {name}"))
     states = [_signal(column, name) for name, column in zip(y_names, draft.outputs, strict=True)]
-    for name, (constant, damping) in zip(y_names, lag_names, strict=True):
-        if damping:
-            speed, signal = speeds[name]
-            ends = f"{signal.lower!r}, {signal.upper!r}"
-            states.append((f"Signal({_text(speed)}, {_text(signal.unit)}, {ends})", "not measured"))
-            pull = f"({name}_steady - x.{name}) / {constant}**2"
-            rates.append((f"{pull} - 2 * {damping} / {constant} * x.{speed}", "second-order lag"))
+    for name, (speed, signal) in speeds.items():
+        ends = f"{signal.lower!r}, {signal.upper!r}"
+        states.append((f"Signal({_text(speed)}, {_text(signal.unit)}, {ends})", "not measured"))
+        rates.append((second[name][0].format(speed), second[name][1]))
     corrected = [n for n in y_names if n not in speeds] + [speed for speed, _ in speeds.values()]
     pace, _ = slowest(lags, draft.length)
     dt, length = draft.period, draft.length
@@ -513,7 +623,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         "",
         "",
         f"class {kind}(Prior):",
-        '    """A first prior: each output is a lag of all inputs and disturbances."""',
+        '    """A first prior: each output is a lag, or an integral, of all inputs and disturbances."""',
         "",
         f"    # {MARK}: write the machine's own equations in xdot; states need not be measured",
         "    states = (",
@@ -522,7 +632,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         "    inputs = (",
         *(
             f"        {text},  # {note}"
-            for text, note in (_signal(c, n) for c, n in zip(draft.inputs, u_names, strict=True))
+            for text, note in (_signal(c, n, acts=True) for c, n in zip(draft.inputs, u_names, strict=True))
         ),
         "    )",
         f"    outputs = states[:{len(y_names)}]",
@@ -596,16 +706,18 @@ def _first_rest(draft: Draft, gains: Array, offsets: Array) -> tuple[list[float]
     """Outputs, inputs and disturbances at a steady state of the lags, as close as possible to the recorded medians."""
     n_u = len(draft.inputs)
     y, drives = (np.array([np.nanmedian(c.values) for c in cs]) for cs in (draft.outputs, draft.drives))
-    missing = y - offsets - gains @ drives
+    moves = np.array([lag.integrates(draft.length) for lag in draft.lags])  # steady where the rate is zero
+    missing = np.where(moves, 0.0, y) - offsets - gains @ drives
     sizes = np.array([np.ptp(c.span) for c in (*draft.outputs, *draft.drives)])
     per_y, per_u = sizes[: len(y)], sizes[len(y) : len(y) + n_u]
+    per_y = np.where(moves, np.abs(gains[:, :n_u]) @ per_u, per_y)
     # scaled by the recorded spans: independent of units
     drives[:n_u] += per_u * (np.linalg.pinv(gains[:, :n_u] * per_u / per_y[:, None]) @ (missing / per_y))
     held = [
         float(near(min(max(v, c.span[0]), c.span[1]), np.ptp(c.span) / 500))
         for v, c in zip(drives, draft.drives, strict=True)
     ]
-    return (offsets + gains @ np.array(held)).tolist(), held[:n_u], held[n_u:]
+    return np.where(moves, y, offsets + gains @ np.array(held)).tolist(), held[:n_u], held[n_u:]
 
 
 def horizon_of(draft: Draft) -> tuple[int, str]:
@@ -656,14 +768,22 @@ def _first_control(draft: Draft, n_x: int) -> list[str]:
     limits = [(first_limits(c.span, draft.growth), np.ptp(c.span) / 500) for c in draft.inputs]
     low, high = (_tuple(near(ends[i], step) for ends, step in limits) for i in (0, 1))
     free = f"q={_tuple(['0.0'] * n_x)}, r={_tuple(['0.0'] * len(draft.inputs))}"
-    sigma = _tuple(_rounded(0.005 * float(np.ptp(c.span))) for c in draft.outputs)
+    sigmas = draft.sensor_sigma
+    sigma = _tuple(_rounded(value, 2) for value, _ in sigmas)
+    guessed = [printable(c.full) for c, (_, known) in zip(draft.outputs, sigmas, strict=True) if not known]
+    origin = "" if len(guessed) == len(sigmas) else ", estimated from the recordings"
     return [
         f"    # {MARK}: define the control problem. For a first loop remove the # in front:",
         f"    # control=OCP({horizon}, {free}, u_min={low}, u_max={high},",
         f"    #             # {why}",
         "    #             # weights: one over the square of a deviation that you tolerate",
         f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",
-        f"    # sensor_sigma={sigma},  # standard deviation of each sensor's error",
+        f"    # sensor_sigma={sigma},  # standard deviation of each sensor's error{origin}",
+        *(
+            [f"    # {MARK}: sensor_sigma is a guess for {', '.join(guessed)}: look it up, or record at rest"]
+            if guessed
+            else []
+        ),
         "    # safe_input=(...),  # within these limits, and harmless when a sensor is lost: only you know it",
     ]
 

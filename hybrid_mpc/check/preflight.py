@@ -245,8 +245,8 @@ def _check_recordings(
         dataset = recordings()
     if dataset is None:
         return None
-    for finding in dataset.findings:
-        report.warn(f"recordings: {finding}")
+    for doubtful in dataset.warnings:
+        report.warn(f"recordings: {doubtful}")
     for file, sampling in zip(dataset.files, dataset.sampling, strict=True):
         if sampling > COARSE * spec.dt:
             report.warn(

@@ -306,6 +306,21 @@ def is_rate(rate: Trait, whole: Trait) -> bool:
     return bool(known.sum() >= FEWEST_ROWS and _line(a[known], b[known])[2] >= RATE**2)
 
 
+def driven(output: Trait, inputs: Sequence[Trait]) -> bool:
+    """Whether an input helps to predict an output more than by chance.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> u = np.repeat(rng.standard_normal(40), 10)
+        >>> y = np.convolve(u, 0.9 ** np.arange(60))[:400] + 0.01 * rng.standard_normal(400)
+        >>> driven(Trait("y", "", (y,)), [Trait("u", "", (u,))])
+        True
+        >>> driven(Trait("room", "", (np.sin(np.arange(400) / 50),)), [Trait("u", "", (u,))])
+        False
+    """
+    return _Links().into(output, inputs) >= QUIET
+
+
 def judge_roles(traits: Sequence[Trait], given: Mapping[str, Kind] | None = None) -> dict[str, Verdict]:
     """The role of every column; ``given`` roles are kept and used as evidence.
 
@@ -553,6 +568,13 @@ class _Judge:
                     )
                 else:
                     self._say(trait, "disturbance", "no input affects it, and it affects outputs", False)
+            elif (
+                trait.said == "quantity"
+                and free
+                and any(self.links.into(t, inputs) >= ACTS for t in outputs if t.said != "measured")
+            ):
+                # inputs that affect another output would show in this one, too
+                self._say(trait, "disturbance", "no input affects it", False)
             elif free and trait.said == "":
                 self._say(trait, "output", "no input affects it; it may be a disturbance instead", False)
             else:

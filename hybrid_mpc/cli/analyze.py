@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
-from hybrid_mpc.rules import MOST_SEED
+from hybrid_mpc.rules import MOST_SEED, counted
 
 if TYPE_CHECKING:
     from hybrid_mpc.workflow.analyze import AnalysisSettings
@@ -55,7 +55,7 @@ def analyze(
         progress.finish("")
         progress.start("drawing")
         files = write_analysis(out, given, result, notes, command(settings, out))
-        progress.finish(f"{len(files)} files")
+        progress.finish(counted(len(files), "file"))
     print_summary((), out / "analysis.html", "page")
 
 

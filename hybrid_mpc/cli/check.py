@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
-from hybrid_mpc.rules import printable
+from hybrid_mpc.rules import counted, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -76,12 +76,14 @@ def check(
         problems, found_warnings, in_doubt, lacking = _fit(console, context)
         warnings += found_warnings
     left = left_to_decide(Path(scenario)) if scenario.endswith(".py") else []
+    notes = () if found.dataset is None else found.dataset.notes
+    doubts = "doubt about the structure of the prior", "doubts about the structure of the prior"
     for texts, style, title in (
-        (left, "cyan", "left to decide"), (warnings, "yellow", "warnings"),
-        (in_doubt, "bold yellow", "doubts about the structure of the prior"), (problems, "bold red", "errors"),
+        (notes, "", ("note",)), (left, "cyan", ("left to decide", "left to decide")),
+        (warnings, "yellow", ("warning",)), (in_doubt, "bold yellow", doubts), (problems, "bold red", ("error",)),
     ):  # fmt: skip
         if texts:
-            console.print(f"\n{len(texts)} {title}", style=style)
+            console.print(f"\n{counted(len(texts), *title)}", style=style)
         for number, text in enumerate(texts, 1):
             console.print(printable(f"{number:3}. {text}"), markup=False, soft_wrap=True)
     if problems:
@@ -95,7 +97,24 @@ def check(
                 markup=False, soft_wrap=True,
             )  # fmt: skip
         return
-    console.print("\nNo errors; continue with 'hybrid-mpc run'." if data or fit else "\nNo errors.")
+    console.print(f"\n{_end(len(left), len(warnings), recorded=bool(data or fit))}")
+
+
+def _end(left: int, warnings: int, *, recorded: bool) -> str:
+    """The last line of a check without errors: what is left to do before a run.
+
+    Example:
+        >>> _end(12, 1, recorded=True)
+        "No errors. 12 values are still marked TODO; 1 warning. Look at these, then continue with 'hybrid-mpc run'."
+        >>> _end(0, 0, recorded=True)
+        "No errors; continue with 'hybrid-mpc run'."
+    """
+    todo = [f"{counted(left, 'value is', 'values are')} still marked TODO"] if left else []
+    todo += [counted(warnings, "warning")] if warnings else []
+    if not todo:
+        return "No errors; continue with 'hybrid-mpc run'." if recorded else "No errors."
+    then = "Look at these, then continue with 'hybrid-mpc run'." if recorded else "Look at these."
+    return f"No errors. {'; '.join(todo)}. {then}"
 
 
 def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], ...]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.rules import MOST_SEED, markdown, printable
+from hybrid_mpc.rules import MOST_SEED, counted, markdown, printable
 
 if TYPE_CHECKING:
     from hybrid_mpc.scenario import Scenario
@@ -54,7 +54,7 @@ def data(
     from hybrid_mpc.scenario import load_scenario
 
     files = write_data(load_scenario(source), out, seed, budget, data_set)
-    print(f"{len(files)} recordings and README.md in {out.resolve()}")
+    print(f"{counted(len(files), 'recording')} and README.md in {out.resolve()}")
 
 
 def tell(path: Path, plot: bool) -> None:
@@ -66,7 +66,10 @@ def tell(path: Path, plot: bool) -> None:
     from hybrid_mpc.check.look import look, picture
 
     found, console = look(path), Console(highlight=False)
-    console.print(printable(f"{path.name}: {found.rows} rows, {len(found.columns)} columns"), markup=False)
+    console.print(
+        printable(f"{path.name}: {counted(found.rows, 'row')}, {counted(len(found.columns), 'column')}"),
+        markup=False,
+    )
     console.print(printable(f"time: {found.time}"), markup=False, soft_wrap=True)
     table = Table(
         "column", "unit", "numbers", "from", "to", "", box=None, header_style="bold", pad_edge=False

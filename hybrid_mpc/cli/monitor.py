@@ -9,6 +9,7 @@ import typer
 
 from hybrid_mpc.cli.options import ArtifactFolder, EmptyFolder
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.rules import two_digits
 
 if TYPE_CHECKING:
     from hybrid_mpc.workflow.monitor import MonitorJob, MonitorResult, RecordingResult
@@ -79,12 +80,15 @@ def monitor(
         machine, folder, recordings, resolution=tuple(resolution) if resolution else None,
         calibration=None if learn else calibration, residuals=residuals,
     )  # fmt: skip
-    for finding in job.data.findings:
-        say(f"warning: {finding}")
+    for warning in job.data.warnings:
+        say(f"warning: {warning}")
+    for note in job.data.notes:
+        say(f"note: {note}")
     if learn:
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)
-        line = f"learned from {60 * found.hours:.1f} min for {found.false_alarms_per_hour:g} false alarms per hour"
+        rate = two_digits(found.false_alarms_per_hour)
+        line = f"learned from {60 * found.hours:.1f} min for {rate} false alarms per hour"
         if not found.rated:
             line = f"learned from {60 * found.hours:.1f} min: {found.method}"
         print_summary([line], out / "calibration.json", "limits")
@@ -108,8 +112,8 @@ def watching(job: MonitorJob) -> str:
         )
     channels = ", ".join(dict.fromkeys(one.channel for one in limits.channels))
     return (
-        f"channels: {channels}; limits for {limits.false_alarms_per_hour:g} false alarms per hour, learned from "
-        f"{60 * limits.hours:.1f} min: {limits.method}"
+        f"channels: {channels}; limits for {two_digits(limits.false_alarms_per_hour)} false alarms per hour, learned "
+        f"from {60 * limits.hours:.1f} min: {limits.method}"
     )
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from hybrid_mpc.cli.options import DisturbanceColumns, InputColumns, OutputColumns, TimeColumn
+from hybrid_mpc.rules import counted
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -38,7 +39,7 @@ def new(
     draft = write_scenario(path, data, inputs, outputs, time_column, disturbances)
     lines = [
         *(f"{name}: {note}" for name, notes in draft.notes.items() for note in notes),
-        f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.period:.4g} s",
+        f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.sampling}",
         *([f"  to decide: {draft.doubt}"] if draft.doubt else []),
         f"inputs: {', '.join(c.full for c in draft.inputs)}",
         f"outputs: {', '.join(c.full for c in draft.outputs)}",
@@ -57,6 +58,8 @@ def new(
     lines += [f"not used: {name} ({reason})" for name, reason in draft.left_out.items()]
     count = len(left_to_decide(path))
     words = [shlex.quote(str(path)), *(f"--data {shlex.quote(str(file))}" for file in data)]
-    lines.append(f"{path}: {count} lines are left to decide. Next: hybrid-mpc check {' '.join(words)}")
+    lines.append(
+        f"{path}: {counted(count, 'line is', 'lines are')} left to decide. Next: hybrid-mpc check {' '.join(words)}"
+    )
     for line in lines:
         print(printable(line))

@@ -57,6 +57,10 @@ class Bars(Progress):
             printable(f"warning: {text}"), style="yellow", markup=False, highlight=False, soft_wrap=True
         )
 
+    def note(self, text: str) -> None:
+        """Print a line above the bars."""
+        self._bars.console.print(printable(f"note: {text}"), markup=False, highlight=False, soft_wrap=True)
+
     def finish(self, text: str) -> None:
         """Complete the stage and its parts."""
         for task in self._parts.values():
@@ -94,13 +98,17 @@ class Lines(Progress):
         """Print a line."""
         say(f"  warning: {text}")
 
+    def note(self, text: str) -> None:
+        """Print a line."""
+        say(f"  note: {text}")
+
     def finish(self, text: str) -> None:
         """Print the result and the duration of the stage."""
         say(f"  {text or 'done'} after {time.monotonic() - self._stage:.1f} s")
 
 
 class Unwarned(Progress):
-    """Passes progress on and drops warnings, which the command prints after its results."""
+    """Passes progress on and drops warnings and notes, which the command prints after its results."""
 
     def __init__(self, progress: Progress) -> None:
         self.start, self.update, self.finish = progress.start, progress.update, progress.finish  # type: ignore[method-assign]

@@ -18,7 +18,7 @@ from hybrid_mpc.cli.options import (
     Scheduler,
     TimeColumn,
 )
-from hybrid_mpc.rules import MOST_SEED
+from hybrid_mpc.rules import MOST_SEED, counted, two_digits
 
 if TYPE_CHECKING:
     from hybrid_mpc.compare.sequential import Comparison
@@ -235,9 +235,12 @@ def watch_lines(found: WatchResult | Absent) -> list[str]:
     if isinstance(found, Absent) or found.limits is None:
         return [f"monitor: {found.reason}"]
     limits = found.limits
+    rate = f"for {two_digits(limits.false_alarms_per_hour)} false alarms per hour"
+    if not limits.rated:
+        rate = "too little to promise a rate of false alarms"
     lines = [
-        f"monitor of {found.kind}: learned from {60 * limits.hours:.1f} min for {limits.false_alarms_per_hour:g} false "
-        f"alarms per hour; {len(found.alarms)} alarms on recordings"
+        f"monitor of {found.kind}: learned from {60 * limits.hours:.1f} min {rate}; "
+        f"{counted(len(found.alarms), 'alarm')} on recordings"
     ]
     for row in found.faults or ():
         seen = "not detected" if row.delay_s is None else f"detected after {row.delay_s:.3g} s"

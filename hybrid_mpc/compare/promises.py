@@ -33,6 +33,7 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.equilibrium import equilibrium_input, hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
+from hybrid_mpc.rules import counted
 from hybrid_mpc.scenario import Task
 
 Array = NDArray[np.float64]
@@ -532,7 +533,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
     assert trials
     worst = max(trials, key=lambda one: one.worst.size)
     moved = len(trials) - 1 if any(not one.fixed for one in point.model.parameters) else 0
-    what = f"{len(trials)} loops with constant loads" + (
+    what = f"{counted(len(trials), 'loop')} with constant loads" + (
         f", {moved} of them on models with parameters {100 * OFF:.0f} % off," if moved else ""
     )
     within = f"{len(settled)} of {what} settle within the noise"
@@ -547,8 +548,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
     if len(point.held) > point.model.n_u:
         names = ", ".join(point.model.outputs[i].name for i in point.held)
         lacks.append(
-            f"{len(point.held)} outputs ({names}) are controlled by {point.model.n_u} input"
-            + "s" * (point.model.n_u > 1)
+            f"{counted(len(point.held), 'output')} ({names}) are controlled by {counted(point.model.n_u, 'input')}"
         )
     if why := ranks(point).why:
         lacks.append(why)
@@ -679,7 +679,7 @@ def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Pr
     if lacks or worst is None:
         return Promise(name, "not promised", "; ".join(lacks), SOFTER)
     point, signal, own = worst
-    late = f"{own.delay_periods} period" + "s" * (own.delay_periods != 1)
+    late = counted(own.delay_periods, "period")
     evidence = (
         f"at {signal.name} in {point.title}: gain {own.gain_down:.2g} to {own.gain_up:.3g} times, phase "
         f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay"
@@ -760,7 +760,9 @@ def limits(
             "shown",
             f"{evidence}; every period has a plan within the inputs' limits ({len(sources)} periods tested)",
         )
-    evidence = f"no hard bound is relaxed from {len(starts)} starts within {100 * NEAR:.0f} % of a bound"
+    evidence = (
+        f"no hard bound is relaxed from {counted(len(starts), 'start')} within {100 * NEAR:.0f} % of a bound"
+    )
     return Promise(
         name,
         "shown",

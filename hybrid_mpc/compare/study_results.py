@@ -29,6 +29,7 @@ from hybrid_mpc.plots import studies
 from hybrid_mpc.plots.style import name_of, save
 from hybrid_mpc.records import known
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, write_report
+from hybrid_mpc.rules import counted
 
 FACTORS = ("model", "task", "controller", "solver", "horizon", "monitor", "faults")
 PAIR = ("draw", "seed")
@@ -432,7 +433,8 @@ def _failures(results: StudyResults) -> list[Section]:
         (*(_cell(row[c]) for c in columns), row["error"].strip().splitlines()[-1])
         for _, row in failed.iterrows()
     ]
-    text = f"{len(failed)} runs failed; the first are listed. Column 'error' of the table contains the tracebacks."
+    text = f"{counted(len(failed), 'run')} failed; the first are listed. "
+    text += "Column 'error' of the table contains the tracebacks."
     return [Section("Failed runs", (text,), (), [Table((*columns, "error"), rows[:SHOWN_FAILURES])])]
 
 

@@ -13,6 +13,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
+from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
 ROUNDING = 1e-12
@@ -334,7 +335,7 @@ def is_constant(values: Array) -> bool:
 def _too_few(one: Excitation, parameters: int, need: int) -> str:
     count = len(one.lines)
     told = ", ".join(f"{f:.3g}" for f in one.lines)
-    lines = f"{count} line{'s' * (count != 1)} ({told} Hz)" if count else "no line"
+    lines = f"{counted(count, 'line')} ({told} Hz)" if count else "no line"
     return (
         f"{one.name} has {lines}, {parameters} parameters of a linear model need {need}. Add a multisine, a chirp or "
         "steps."

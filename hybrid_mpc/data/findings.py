@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
 from hybrid_mpc.machine.units import Conversion, conversion
+from hybrid_mpc.rules import counted
 
 if TYPE_CHECKING:
     from hybrid_mpc.data.recording import Recording
@@ -100,6 +101,11 @@ class Finding:
     count: int
     message: str
     refused: bool = False
+
+    @property
+    def is_note(self) -> bool:
+        """Whether it says only what was done unambiguously while reading: nothing is doubtful, nothing left to do."""
+        return self.kind == "read"
 
     def __str__(self) -> str:
         return f"{self.file}: {self.message}"
@@ -325,7 +331,7 @@ def _jumping(channel: Channel, jumps: Indices, size: str, digits: int, told: str
     """The finding about a channel with jumps, from its recorded numbers."""
     y, k, count, unit = channel.y, int(jumps[0]), len(jumps), f" {channel.signal.unit}" * (digits < 10)
     message = (
-        f" jumps {count} time{'s' * (count > 1)} by about {size} (first from {y[k - 1]:.{digits}g} to "
+        f" jumps {counted(count, 'time')} by about {size} (first from {y[k - 1]:.{digits}g} to "
         f"{y[k]:.{digits}g}{unit} at {channel.t[k]:.6g} s): {told}"
     )
     return channel.finding("wrapped", k, count, message, refused)

@@ -15,6 +15,7 @@ from hybrid_mpc.data.cells import BLANK, Cells, cause, cells_of, is_number, is_s
 from hybrid_mpc.data.names import name_and_unit, said_by, words_of
 from hybrid_mpc.data.source import Columns, Series, Source, clocked
 from hybrid_mpc.records import shown
+from hybrid_mpc.rules import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,7 +151,7 @@ class Frame:
                 at, x = time.values[rows, 0], one.values[rows, 0]
                 order = np.argsort(at, kind="stable")
                 found.append(Series(name, at[order], x[order], one.faults.get(value, "")))
-        note = f"long form: {len(several)} signals, named in column {shown(tags[0])}"
+        note = f"long form: {counted(len(several), 'signal')}, named in column {shown(tags[0])}"
         return replace(clocked(source.path, source.sha256, found, times[0]), notes=(*source.notes, note))
 
     def is_measured(self, name: str) -> bool:

@@ -23,6 +23,7 @@ from hybrid_mpc.data.source import LARGEST, LISTED, Series, Source, clocked, lin
 from hybrid_mpc.data.vectors import vector_source
 from hybrid_mpc.errors import InputError, MissingPackage, named_extra
 from hybrid_mpc.records import shown
+from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
 MOST_FIELDS = 64  # longest array in a message that is read as signals
@@ -81,7 +82,7 @@ def _source(
         series.append(Series(_named(name, unit), t[last], np.asarray(values, np.float64)[last]))
     told = f" Not read: {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
     clocks = len({(len(one.t), *one.t[[0, -1]]) for one in series})
-    notes = (*([note] if note else []), f"{len(series)} signals, {clocks} clock{'s' * (clocks > 1)}")
+    notes = (*([note] if note else []), f"{counted(len(series), 'signal')}, {counted(clocks, 'clock')}")
     if twice:
         notes = (*notes, f"{twice} samples are left out: a later sample has the same stamp")
     return replace(clocked(path, sha256, series, note=told), unread=tuple(unread), notes=notes)

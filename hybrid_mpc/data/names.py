@@ -186,7 +186,8 @@ ACTUATOR = words_of(  # words for an actuator
     "tension chauffage pompe vanne power burner damper rudder elevator aileron propeller rotor"
 )
 DISTURBANCE = words_of(  # words for what acts on a machine without being commanded
-    "ambient outside outdoor environment umgebung aussen weather wind disturbance disturbances disturb supply battery "
+    "ambient outside outdoor environment umgebung umgebungstemperatur aussentemperatur "
+    "aussen weather wind disturbance disturbances disturb supply battery "
     "mains reservoir storung sun solar radiation irradiance push kick"
 )
 MEASURED = words_of(  # words for a sensor's output, whatever it measures
@@ -197,7 +198,7 @@ QUANTITY = words_of(  # words for quantities of a machine
     "temperature temp temperatur temperatura level fullstand niveau nivel position pos angle ang winkel angulo "
     "speed vel velocity geschwindigkeit drehzahl velocidade rate pressure druck concentration height altitude "
     "heading yaw pitch roll theta phi psi alpha beta gamma q dq qd x z omega distance displacement "
-    "acceleration acc accel hohe weg pendulum cart"
+    "acceleration acc accel hohe weg pendulum cart room raum raumtemperatur hallentemperatur zulauftemperatur"
 )
 ANGLES = ("rad", "mrad", "deg", "°", "rev", "turn")
 """Units of a column that may be an angle with jumps by full turns."""

@@ -26,6 +26,7 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
 from hybrid_mpc.machine.units import Conversion, conversion
 from hybrid_mpc.records import shown
+from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.int8]
@@ -202,7 +203,7 @@ def _count_problems(spec: DataSpec, prior: Signals) -> list[str]:
         *((f"inputs_of {stem!r}", "input", names, prior.inputs) for stem, names in spec.inputs_of.items()),
     ]
     return [
-        f"data specification: {role} has {len(names)} column{'s' * (len(names) != 1)} "
+        f"data specification: {role} has {counted(len(names), 'column')} "
         f"({', '.join(map(repr, names)) or 'none'}) for a prior with {len(signals)} {word}"
         f"{'s' * (len(signals) != 1)} ({', '.join(s.label for s in signals) or 'none'}). Name one column per signal, "
         "in the prior's order."
@@ -369,7 +370,7 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
             findings += jumping
             if angle is not None:
                 values[there, j] = angle.angle
-                note = f", with {len(angle.jumps)} jumps of a full turn taken out"
+                note = f", with {counted(len(angle.jumps), 'jump')} of a full turn taken out"
                 cuts |= set(np.flatnonzero(there)[angle.unclear].tolist())
         channel = Channel(path.name, name, signal, t, values[:, j])
         if clean and j:
@@ -447,7 +448,7 @@ def _one_clock(
         twice = np.r_[False, (values[1:] == values[:-1]).all(axis=1)][: len(values)]
         if twice.any():
             count = int(twice.sum())
-            what = f"{count} rows repeat the previous row, the first is this one. They are left out."
+            what = f"{counted(count, 'row repeats', 'rows repeat')} the previous row, the first is this one; left out."
             tell(int(np.argmax(twice)), count, what)
             numbers = [columns.numbers[j] for j in np.flatnonzero(~twice).tolist()]
             columns, values = replace(columns, values=columns.values[~twice], numbers=numbers), values[~twice]

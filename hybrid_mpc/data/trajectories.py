@@ -93,7 +93,7 @@ class Dataset:
         files: File names, in the order given.
         sha256: SHA-256 of each file, in the same order.
         hash: One hash of all files' names and contents, independent of their order and folder.
-        findings: Doubtful data (:mod:`hybrid_mpc.data.findings`). Default: none.
+        findings: Doubtful data (:mod:`hybrid_mpc.data.findings`), and how files were read. Default: none.
         sampling: Median step [s] of the time stamps of each file, in the same order. Default: unknown.
     """
 
@@ -105,6 +105,16 @@ class Dataset:
     hash: str
     findings: tuple[Finding, ...] = ()
     sampling: tuple[float, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is doubtful about the recordings, one text per finding."""
+        return tuple(str(one) for one in self.findings if not one.is_note)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How files were read that needed more than a plain table, e.g. a decimal comma; one text per file."""
+        return tuple(str(one) for one in self.findings if one.is_note)
 
     def by_role(self, role: Role) -> tuple[Trajectory, ...]:
         """The trajectories of one role, in order."""

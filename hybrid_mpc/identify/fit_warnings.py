@@ -20,6 +20,8 @@ AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
 HARDLY = 0.98
 """Error of a fit over that of the nominal values above which the fit is no improvement."""
+NEARLY = 0.05
+"""Largest change of a parameter, and largest standard error, over its nominal value, that confirm the nominal value."""
 LATE = 4.0
 """Longest delay of the inputs [model periods] that is tested if no delay is fitted."""
 SHORTEST = 0.01
@@ -44,7 +46,7 @@ def warnings_of(
         )
     if not len(chosen.covariance):
         return (*warnings, "no fit improved on the nominal parameters") if fit.free else ()
-    if gained > HARDLY:
+    if gained > HARDLY and not _confirmed(fit, chosen):
         warnings.append(
             f"the fit hardly improves on the nominal parameters (its error is {gained:.3f} of theirs): either they are "
             "right, or the prior lacks an effect that no parameter describes"
@@ -54,6 +56,15 @@ def warnings_of(
         if min(value - low, high - value) < AT_BOUND * (high - low):
             warnings.append(f"{p.label} ends at a bound ({value * (abs(p.value) or p.upper - p.lower):.4g})")
     return tuple(warnings)
+
+
+def _confirmed(fit: OutputFit, chosen: Fitted) -> bool:
+    """Whether the fit surely finds the nominal values again, as after they were taken from an earlier fit."""
+    count = len(fit.free)
+    nominal, sizes = fit.nominal[:count], np.abs(fit.nominal[:count])
+    near = np.abs(chosen.theta[:count] - nominal) <= NEARLY * sizes
+    sure = np.sqrt(np.maximum(np.diag(chosen.covariance)[:count], 0.0)) <= NEARLY * sizes
+    return bool(not chosen.unidentified and (near & sure).all())
 
 
 def late_inputs(

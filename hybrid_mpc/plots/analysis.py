@@ -32,6 +32,7 @@ from hybrid_mpc.plots.style import (
     shared_legend,
     title_axes,
 )
+from hybrid_mpc.rules import counted
 
 _MARKERS = {"phy": "x", "prior": "x", "mopgrnn": "o", "hybrid": "o", "oracle": "s"}
 _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)
@@ -92,7 +93,7 @@ def pole_map(poles: Mapping[str, Any], dt: float, *, zeros: Mapping[str, Any] | 
     whole.add_patch(Rectangle(*box, fill=False, edgecolor="black", linewidth=0.8, zorder=5))
     grid = "grid: damping ratio, natural frequency every {:.3g} rad/s"
     away = sum(int(np.sum(np.maximum(np.abs(z.real), np.abs(z.imag)) > extent)) for z in nulls.values())
-    outside = f", {away} zero{'s' * (away != 1)} outside of the frame" if away else ""
+    outside = f", {counted(away, 'zero')} outside of the frame" if away else ""
     title_axes(whole, f"z-plane, stable inside the circle{outside}\n" + grid.format(0.1 * np.pi / dt))
     title_axes(zoom, "enlarged: slow poles near z = 1\n" + grid.format(_round(half / dt / 5)))
     shared_legend(figure)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.rules import Line
+from hybrid_mpc.rules import Line, two_digits
 from hybrid_mpc.watch.readings import Channel
 
 Array = NDArray[np.float64]
@@ -133,6 +133,21 @@ class WatchLimits:
             raise InputError(
                 f"limits: give one positive travel for each output, got {self.travel} [HM-WATCH-005]"
             )
+
+    @property
+    def words(self) -> str:
+        """The promised rate of false alarms; or that none is promised, and from how little data.
+
+        Example:
+            >>> WatchLimits("energy", 1.0, (), (), (), 10 / 360, hours=2.0).words
+            'limits for 0.028 false alarms an hour, learned from 2 h of nominal data'
+            >>> WatchLimits("energy", 1.0, (), (), (), 10.0, hours=0.1, rated=False).words
+            'no rate of false alarms is promised: 0.1 h of nominal data are too few for 10 an hour'
+        """
+        hours, rate = two_digits(self.hours), two_digits(self.false_alarms_per_hour)
+        if not self.rated:
+            return f"no rate of false alarms is promised: {hours} h of nominal data are too few for {rate} an hour"
+        return f"limits for {rate} false alarms an hour, learned from {hours} h of nominal data"
 
     def of(self, channel: str) -> tuple[ChannelLimit, ...]:
         """Limits of a channel, the shortest first."""

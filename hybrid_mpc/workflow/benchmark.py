@@ -236,7 +236,7 @@ def _read(
     if settings.model is None:
         try:
             data = read_training(scenario, settings.data)
-            warnings += [str(finding) for finding in data.dataset.findings]
+            warnings += data.dataset.warnings
         except InputError as error:
             problems += error.problems
     for path in settings.test:

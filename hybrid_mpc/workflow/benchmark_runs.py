@@ -172,8 +172,8 @@ def read_test(
             f"{path}: every part is too short for a free run after a warm-up of {spec.warm_up:g} s. Give a longer "
             "recording [HM-WORKFLOW-016]"
         )
-    for finding in dataset.findings:
-        warn(str(finding))
+    for warning in dataset.warnings:
+        warn(warning)
     return dataset.whole
 
 

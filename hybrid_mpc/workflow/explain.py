@@ -98,8 +98,10 @@ def read_result(out: Path) -> ExplainResult:
 def _recordings(context: Context, make: type[Prior]) -> Dataset:
     """Recordings; test recordings are optional."""
     data = load_trajectories(context.files, make(), context.spec, needed=NEEDED)
-    for finding in data.findings:
-        context.progress.warn(str(finding))
+    for warning in data.warnings:
+        context.progress.warn(warning)
+    for note in data.notes:
+        context.progress.note(note)
     return data
 
 

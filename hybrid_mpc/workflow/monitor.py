@@ -203,7 +203,8 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
     result = {
         "kind": job.kind,
         "recordings": rows,
-        "warnings": [str(finding) for finding in job.data.findings],
+        "warnings": job.data.warnings,
+        "notes": job.data.notes,
         "gaps": [cut._asdict() for cut in gaps],
         "not_watched": [cut._asdict() for cut in short],
         "limits": job.limits,

@@ -29,7 +29,7 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
             f"model of scenario {kit.name or '(unnamed)'}: an older version wrote it, without a data specification. "
             "Run the scenario again [HM-WORKFLOW-027]"
         )
-    spec, problems, found, doubts = kit.predicting.data, [], [], []
+    spec, problems, found, doubts = kit.predicting.data, [], [], list[str]()
     if twice := sorted({p.name for p in paths if [q.stem for q in paths].count(p.stem) > 1}):
         raise InputError(
             f"recordings: {', '.join(twice)} given more than once; file names must differ. Rename or remove a file "
@@ -42,7 +42,7 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
         except InputError as error:
             problems += str(error).splitlines()
             continue
-        doubts += [str(finding) for finding in data.findings]
+        doubts += data.warnings
         if data.sampling[0] > COARSE * spec.dt:
             problems.append(
                 f"{path}: sampled every {data.sampling[0]:.3g} s, too slow for the model's period of {spec.dt:g} s. "

@@ -217,7 +217,7 @@ def differing(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Text that names the changed inputs of a stage; empty if none has changed."""
     differ = [name for name, key in now.items() if key and key != before.get(name)]
     differ += [name for name in before if name not in now]
-    return f"{', '.join(differ)} {'has' if len(differ) == 1 else 'have'} changed" if differ else ""
+    return f"changed: {', '.join(differ)}" if differ else ""
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:

@@ -16,6 +16,7 @@ from hybrid_mpc.identify.tune import SearchResult, SearchSpace, check_numbers, t
 from hybrid_mpc.plots import tune as plots
 from hybrid_mpc.plots.style import save
 from hybrid_mpc.report.page import Cell, Table
+from hybrid_mpc.rules import counted
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.settings import RunSettings
@@ -99,7 +100,7 @@ def run_tuning(
                 f"trial {number}: validation E_sim {error:.4g}",
             ),
         )
-        context.progress.finish(f"{len(found.trials)} trials")
+        context.progress.finish(counted(len(found.trials), "trial"))
         _write(context, settings, found)
         return found
 

@@ -126,8 +126,8 @@ class Work:
     @property
     def doubts(self) -> list[str]:
         """What is doubtful about the recordings."""
-        read = [found.findings for found in self.sets.values() if isinstance(found, Dataset)]
-        return list(dict.fromkeys(str(finding) for findings in read for finding in findings))
+        read = [found.warnings for found in self.sets.values() if isinstance(found, Dataset)]
+        return list(dict.fromkeys(warning for warnings in read for warning in warnings))
 
     def trajectories(self, data_set: str, role: str, most: int) -> list[Trajectory]:
         """The first trajectories of a role, as they were recorded."""

@@ -54,6 +54,32 @@ def test_machine_and_recordings_are_told_in_one_pass(call, machine, tmp_path):
         assert words in told
 
 
+def test_a_decimal_comma_that_is_read_is_a_note_and_no_warning(call, machine, tmp_path):
+    words = []
+    for name in ("monday", "tuesday"):
+        table = (machine / f"{name}.csv").read_text().replace(",", ";").replace(".", ",")
+        (tmp_path / f"{name}.csv").write_text(table)
+        words += ["--data", tmp_path / f"{name}.csv"]
+    code, told = checked(call, machine / "my_machine.py", *words)
+    assert code == 0
+    assert "2 notes" in told
+    assert told.count("decimal comma") == 2
+    assert "decimal comma" not in told.partition(" warning")[2]
+
+
+def test_what_is_marked_is_counted_at_the_end(call, machine, tmp_path):
+    text = (machine / "my_machine.py").read_text()
+    for marks in (1, 2):
+        (tmp_path / "marked.py").write_text(text + "# TODO: decide this\n" * marks)
+        code, told = checked(call, tmp_path / "marked.py", "--data", machine / "monday.csv")
+        assert code == 0
+        last = told.rpartition("No errors")[2]
+        assert f"{marks} value" in last
+        assert "TODO" in last
+        assert f"{marks} left to decide" in told
+    assert "1 errors" not in told
+
+
 @pytest.mark.full
 def test_a_machine_in_casadi_is_checked_without_torch(machine):
     words = ["check", str(machine / "my_machine.py"), "--data", str(machine / "monday.csv")]

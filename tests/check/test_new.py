@@ -84,6 +84,80 @@ def test_a_disturbance_that_is_measured(call, tmp_path):
     assert code == 0, told + error
 
 
+def heated_room(path, rows, dt, seed):
+    """An oven of 0.5 K/% and 40 s in a measured room that nothing heats; sensors with errors of 0.15 and 0.02 K."""
+    rng, t = np.random.default_rng(seed), dt * np.arange(rows)
+    u = np.repeat(rng.choice([0.0, 40.0, 100.0], rows // 20 + 1), 20)[:rows]
+    room = 20 + 1.5 * np.sin(2 * np.pi * t / 900 + seed) + 0.02 * rng.standard_normal(rows)
+    warmth = [room[0]]
+    for power, outside in zip(u[:-1], room[:-1], strict=True):
+        rest = outside + 0.5 * power
+        warmth.append(rest + (warmth[-1] - rest) * np.exp(-dt / 40.0))
+    noisy = np.array(warmth) + 0.15 * rng.standard_normal(rows)
+    return write_csv(
+        path, {"time [s]": t, "Heizung [%]": u, "Raumtemperatur [K]": room, "Temperatur [K]": noisy}
+    )
+
+
+def test_a_room_that_no_input_affects_in_recordings_of_three_periods(call, tmp_path):
+    sampled = [("a", 900, 2.0, 1), ("b", 450, 4.0, 2), ("c", 1200, 1.0, 3)]
+    files = [heated_room(tmp_path / f"{name}.csv", rows, dt, seed) for name, rows, dt, seed in sampled]
+    machine = tmp_path / "oven.py"
+    code, told, error = call("new", machine, *(word for file in files for word in ("--data", file)))
+    assert code == 0, error
+    assert "sampled every 1 s, 2 s, 4 s" in told
+    prior = load_scenario(str(machine)).prior()
+    assert [s.name for s in prior.disturbances] == ["Raumtemperatur"]
+    assert [s.name for s in prior.states] == ["Temperatur"]
+    assert (prior.inputs[0].lower, prior.inputs[0].upper) == (0.0, 100.0)
+    assert prior.values["T_Temperatur"] == pytest.approx(40.0, rel=0.05)
+    assert "slowest time constant that matters is 39.8 s" in told
+    (sigma,) = re.findall(r"# sensor_sigma=\(([\d.]+),\)", machine.read_text())
+    assert 0.15 <= float(sigma) < 0.2  # the machine's motion within three samples counts, too
+    assert not [line for line in left_to_decide(machine) if "sensor_sigma" in line or "limits" in line]
+
+
+def test_an_output_given_by_the_user_that_no_input_affects_sets_no_horizon(call, tmp_path):
+    file = heated_room(tmp_path / "a.csv", 900, 2.0, 1)
+    words = ("--output-column", "Raumtemperatur", "--output-column", "Temperatur")
+    code, told, error = call("new", tmp_path / "oven.py", "--data", file, *words)
+    assert code == 0, error
+    assert re.search(r"time constant that matters is .* of Temperatur", told)
+
+
+def test_a_recording_without_visible_noise_and_without_limits_leaves_both_to_decide(tmp_path):
+    t = 0.1 * np.arange(600)
+    columns = {"time [s]": t, "pump [l/min]": 3 + np.sin(t), "flow [l/min]": 5 + np.sin(t - 0.5)}
+    file = write_csv(tmp_path / "a.csv", columns)
+    write_scenario(tmp_path / "pump.py", file, ["pump"], ["flow"])
+    left = left_to_decide(tmp_path / "pump.py")
+    assert any("sensor_sigma" in line for line in left)
+    assert any("limits of the actuator" in line for line in left)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_an_output_that_integrates(tmp_path, late):
+    """A slide of 12 mm/s per V and 1.5 mm/s without, at once or behind a lag; the sensor's error is 0.02 mm."""
+    rng, n, dt, x, speed, aim = np.random.default_rng(3), 3000, 0.02, 0.0, 0.0, 0.0
+    u, y = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        aim = rng.uniform(-10, 10) if k % 40 == 0 else aim
+        u[k], y[k] = np.clip(aim - 0.05 * x, -10, 10), x + 0.02 * rng.standard_normal()
+        goal = 12 * u[k] + 1.5
+        speed = speed + dt * (goal - speed) / late if late else goal
+        x += dt * speed
+    file = write_csv(tmp_path / "a.csv", {"time [s]": dt * np.arange(n), "u [V]": u, "way [mm]": y})
+    write_scenario(tmp_path / "slide.py", file)
+    scenario = load_scenario(str(tmp_path / "slide.py"))
+    prior = scenario.prior()
+    assert prior.values["k_way_u"] == pytest.approx(12.0, rel=0.05)
+    assert prior.values["drift_way"] == pytest.approx(1.5, rel=0.1)
+    assert len(prior.states) == (2 if late else 1)
+    assert (prior.inputs[0].lower, prior.inputs[0].upper) == (-10.0, 10.0)
+    assert preflight(scenario).problems == ()
+    assert re.search(r"# sensor_sigma=\(0\.02\d*,\)", (tmp_path / "slide.py").read_text())
+
+
 def test_a_swing_has_two_states(machine, tmp_path):
     draft = write_scenario(tmp_path / "swing.py", machine / "monday.csv")
     assert (draft.time.full, [c.full for c in draft.inputs]) == ("time_s", ["tau_nm"])

@@ -145,6 +145,7 @@ def test_a_row_of_units_is_read_and_a_contradiction_with_the_header_is_named(tmp
     spec = replace(SPEC, time=0.01)
     (told,) = read(path, "\n".join(["clock,tau,phi", "s,1,1", *rows]), spec=spec).findings
     assert told.kind == "read"
+    assert told.is_note
     assert "row 2 is a row of units" in told.message
     refused(path, "\n".join(["time_s,tau,phi [deg]", "s,N m,rad", *rows]), "'deg'")
     refused(path, "\n".join(["time_s,tau,phi [degC]", "s,N m,K", *rows]), "'degC'")

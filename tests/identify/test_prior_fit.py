@@ -1,6 +1,7 @@
 """The fit of a prior to measured outputs: true parameters found again, from any start, with what recordings have."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from simulated_pendulum import DT, TRUTH, Pendulum, record
 
 from hybrid_mpc import InputError, Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.fit import beyond_ranges, refit, smoothed
+from hybrid_mpc.identify.fit_warnings import warnings_of
+from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.shooting import Shooting
@@ -516,15 +519,25 @@ def test_a_state_beyond_its_range_is_named(noisy_runs, fit):
     assert beyond_ranges(Pendulum(), runs) == ()
 
 
-def test_a_fit_that_hardly_improves_says_so(noisy_runs, fit):
+def test_a_fit_that_finds_its_nominal_values_again_raises_no_doubt(noisy_runs, fit):
+    """As after an earlier fit's values were written into the prior."""
+
     class Known(Pendulum):
-        parameters = tuple(replace(p, value=TRUTH[p.name]) for p in Pendulum.parameters)
+        parameters = tuple(replace(p, value=fit.values[p.name]) for p in Pendulum.parameters)
 
     again = fitted(Known, noisy_runs)
-    assert any(
-        line.startswith(("no fit improved on", "the fit hardly improves on")) for line in again.warnings
-    )
+    assert not any("hardly improves" in line for line in again.warnings)
     assert not any("improve" in line for line in fit.warnings)  # from wrong nominal values
+
+
+def test_a_fit_that_hardly_improves_says_so_unless_it_confirms_its_nominal_values():
+    free = tuple(replace(p, value=TRUTH[p.name]) for p in Pendulum.parameters if not p.fixed)
+    ones = np.ones(len(free))
+    problem = SimpleNamespace(free=free, nominal=ones, lower=0.0 * ones, upper=3.0 * ones)
+    sure, unsure = (Fitted(ones, size**2 * np.eye(len(free)), ()) for size in (0.01, 0.2))
+    moved = Fitted(1.2 * ones, sure.covariance, ())
+    said = [len(warnings_of(problem, one, 0.0, 0.999)) for one in (sure, unsure, moved)]
+    assert said == [0, 1, 1]
 
 
 def test_recordings_that_follow_each_other_count_as_one() -> None:

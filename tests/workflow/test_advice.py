@@ -59,6 +59,12 @@ def warned(results: Results, warning: str) -> Results:
     return replace(results, data=replace(results.data, warnings=(warning,)))
 
 
+def test_how_a_file_was_read_asks_for_nothing(results):
+    """A note on the recordings is no hint."""
+    noted = replace(results, data=replace(results.data, notes=("a.csv: as it was read: a decimal comma",)))
+    assert advice(noted) == advice(results)
+
+
 def better(results: Results, error: float) -> dict[str, object]:
     """Baselines of which ARX has an error."""
     arx = results.prior.baselines["ARX"]
@@ -136,6 +142,15 @@ def test_doubt_about_the_prior_comes_first_and_is_told_once(results):
         assert said == [
             "The structure of the prior is in doubt: ARX has an error of 0.02, the fitted prior 0.1.", *others
         ]  # fmt: skip
+
+
+def test_noise_that_is_declared_smaller_than_estimated_leaves_room_for_a_better_model(results):
+    (error,) = results.evaluation.scores[results.choice.choice.recommended].model.rmse.values()
+    found = prior(results, fit=replace(results.prior.fit, sigma=(error / 1.1,)))
+    for declared, verdict in ((error / 3.7, "plain"), (error / 1.2, "good"), (error, "good")):
+        (hint,) = [one for one in advice(found, declared=(declared,)) if "sensor noise" in one.finding]
+        assert hint.verdict == verdict
+        assert ("no better model" in hint.remedy) == (verdict == "good")
 
 
 def test_an_error_that_is_the_sensor_s_noise_is_told(results):

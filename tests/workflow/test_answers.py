@@ -132,3 +132,26 @@ def test_an_oracle_that_is_beaten_is_explained(results):
     for name in results.control.means:
         results = with_loops(results, name, "oracle", cost=0.0)
     assert oracle_words(results.control) == ()
+
+
+def with_limits(found, limits):
+    files = {
+        name: replace(file, limits={**file.limits, found.kind: limits}) for name, file in found.watch.items()
+    }
+    return replace(found, watch=files)
+
+
+def test_a_rate_that_cannot_be_promised_is_told_with_the_hours(results):
+    limits = replace(results.watch.limits, rated=False, hours=0.1234, false_alarms_per_hour=10 / 0.96)
+    words = lines(monitor_answer(with_limits(results.watch, limits)))
+    assert "0.12 h" in words
+    assert "10.4" not in words
+    rated = replace(limits, rated=True, false_alarms_per_hour=10 / 360)
+    assert "at 0.028 false alarms" in lines(monitor_answer(with_limits(results.watch, rated)))
+
+
+def test_step_times_are_named_by_their_clock(results):
+    words = lines(controller_answer(results))
+    assert "ms of wall time" in words
+    rows = () if isinstance(results.promises, Absent) else results.promises.rows
+    assert words.count("Step time under") == sum(row.name == "step time" for row in rows)

@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass, replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,13 +24,14 @@ from hybrid_mpc.workflow.stage import (
     Stored,
     bring_up_to_date,
     changed,
+    differing,
     read_stage,
     source_of,
     write_stage,
 )  # fmt: skip
 from hybrid_mpc.workflow.stages import report
 from hybrid_mpc.workflow.stages.compare import CONTROL
-from hybrid_mpc.workflow.stages.export import EXPORT, NOISE
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, observed
 from hybrid_mpc.workflow.stages.results import read_results
 
 
@@ -97,7 +98,7 @@ def test_an_edit_runs_what_reads_it(own, call, pattern, put, stages):
     assert code == 0, message
     assert rerun(before, stamps(out)) == stages, said
     if "control" in stages:
-        assert "stage control runs again: control problem has changed" in said + message
+        assert "stage control runs again: changed: control problem" in said + message
     assert "Another" in (out / "report.html").read_text() or stages != ["report"]
 
 
@@ -126,7 +127,7 @@ def test_a_library_that_draws_otherwise_runs_the_report_alone(own, call, library
         before = stamps(out)
         code, said, message = call(*command)
         assert (code, rerun(before, stamps(out))) == (0, ["report"]), said + message
-        assert "stage report runs again: the program has changed" in said + message
+        assert "stage report runs again: changed: the program" in said + message
 
 
 def forget():
@@ -173,7 +174,7 @@ def test_only_control_after_an_edit_takes_the_edited_problem_and_keeps_the_monit
     kept = (out / "model" / "tasks.json").read_bytes()
     code, _, message = call(*command, "--only", "control")
     assert code == 2
-    assert "limits of the input has changed" in message
+    assert "changed: limits of inputs" in message
     assert (out / "model" / "tasks.json").read_bytes() == kept
     code, said, message = call(*command, "--only", "noise", "--only", "control")
     assert code == 0, said + message
@@ -264,7 +265,7 @@ def test_another_program_computes_its_stages_again_and_says_why(context, monkeyp
     fresh = Context(context.settings, context.scenario, context.out)
     monkeypatch.setattr(fresh.progress, "warn", warned.append)
     assert bring_up_to_date(fresh, stage) == ""
-    assert warned == ["stage sum runs again: the program has changed"]
+    assert warned == ["stage sum runs again: changed: the program"]
     again = Context(context.settings, context.scenario, context.out)
     assert bring_up_to_date(again, stage) == "up to date"
 
@@ -433,5 +434,15 @@ def test_loops_read_tasks_by_what_they_say(tmp_path):
 
 
 def test_changes_are_named():
-    assert changed({"a": "1", "b": "2"}, {"a": "3", "c": "4"}) == "a, c, b have changed"
+    assert changed({"a": "1", "b": "2"}, {"a": "3", "c": "4"}) == "changed: a, c, b"
     assert changed({}, {"plant": ""}) == "a change of plant cannot be detected, so it counts as changed"
+
+
+def test_the_observer_s_stage_names_what_it_reads():
+    """A horizon of its own is no change of weights alone."""
+    scenario = load_scenario("golf_robot")
+    longer = replace(scenario, control=scenario.control.changed(horizon=scenario.control.horizon + 1))
+    before, now = (observed(SimpleNamespace(scenario=one)) for one in (scenario, longer))
+    (label,) = [name for name in now if now[name] != before[name]]
+    assert "horizon" in label
+    assert differing({label: "1"}, {label: "2"}) == f"changed: {label}"

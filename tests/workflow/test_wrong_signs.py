@@ -65,7 +65,7 @@ def test_the_command_shows_fit_errors_and_doubts(call, words, case, code):
         "N4SID",
     ]
     assert ("its sign seems wrong" in told) == (case != "right")
-    assert ("1 errors" in told) == (code == 2)
+    assert ("1 error" in told) == (code == 2)
     assert ("No errors" in told) == (case == "right")
     assert not list(Path(words[case][0]).parent.glob("runs"))
 
@@ -81,7 +81,7 @@ def test_what_the_recordings_do_not_allow_is_told_by_the_command(call, words, tm
     (tmp_path / "short.csv").write_text("\n".join(rows[:20]))
     done, told, _ = call("check", words["right"][0], "--data", tmp_path / "short.csv", "--fit")
     assert done == 2
-    assert "1 errors" in told
+    assert "1 error" in told
 
 
 def test_a_simulated_machine_needs_no_recordings(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from hybrid_mpc.compare.sequential import hardest
 from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
+from hybrid_mpc.rules import counted
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.compare import REPORTED, closed_loops
 from hybrid_mpc.workflow.stages.promises import SEARCH, STRUCTURE
@@ -24,19 +25,20 @@ MOST = 4
 """Largest number of warnings of one kind among the hints; the report's sections list all."""
 
 
-def advice(results: Results, *, explained: bool = False) -> list[Hint]:
+def advice(results: Results, *, explained: bool = False, declared: Sequence[float] = ()) -> list[Hint]:
     """Hints about a finished run: problems first; without a problem, the next step.
 
     Args:
         results: The run's results.
         explained: Whether the run has searched for missing terms. Default: False; a hint may then name the command.
+        declared: Standard deviations of the sensors' errors that the scenario declares. Default: unknown.
 
     Example:
         ``[hint.finding for hint in advice(read_results(path)) if hint.verdict == "bad"]``
     """
     found = [
         *_doubt(results), *_recordings(results), *_prior(results, explained), *_choice(results, explained),
-        *_linear(results), *_floor(results), *_bands(results), *_promises(results), *_loops(results),
+        *_linear(results), *_floor(results, declared), *_bands(results), *_promises(results), *_loops(results),
         *_watching(results),
     ]  # fmt: skip
     if closed_loops(results.control) is not None and not any(hint.verdict == "bad" for hint in found):
@@ -71,7 +73,7 @@ def doubt_of(in_doubt: Sequence[str]) -> str:
     if not in_doubt:
         return ""
     n = len(in_doubt) - 1
-    more = f" (and {n} more reason{'s' * (n > 1)})" if n else ""
+    more = f" (and {counted(n, 'more reason')})" if n else ""
     return f"The structure of the prior is in doubt: {in_doubt[0]}{more}."
 
 
@@ -150,16 +152,27 @@ def _linear(results: Results) -> Iterator[Hint]:
         )  # fmt: skip
 
 
-def _floor(results: Results) -> Iterator[Hint]:
-    """Outputs whose free-run error is about the sensor noise."""
+def _floor(results: Results, declared: Sequence[float]) -> Iterator[Hint]:
+    """Outputs whose free-run error is about the sensor noise: the smaller one of the declared and the estimated."""
     errors = results.evaluation.scores[results.choice.choice.recommended].model.rmse
-    for (label, error), noise in zip(errors.items(), results.prior.fit.sigma, strict=True):
+    estimated = results.prior.fit.sigma
+    given = declared if len(declared) == len(estimated) else estimated
+    for (label, error), noise, own in zip(errors.items(), estimated, given, strict=True):
         name, _, unit = label.partition(" [")
-        if error < FLOOR * noise:
+        if not error < FLOOR * noise:
+            continue
+        said = f"The free-run error of {name} is {error:.2g} {unit.rstrip(']')}: {error / noise:.1f} times its sensor "
+        if error < FLOOR * min(noise, own):
             yield Hint(
-                "good", f"The free-run error of {name} is {error:.2g} {unit.rstrip(']')}: {error / noise:.1f} times "
-                "its sensor noise as estimated by the fit.",
+                "good", f"{said}noise as estimated by the fit.",
                 "These recordings allow no better model. Use a better sensor, or excite the machine more.",
+            )  # fmt: skip
+        else:
+            yield Hint(
+                "plain", f"{said}noise as estimated by the fit, but {error / own:.1f} times the declared noise "
+                f"({own:.2g}).",
+                "Look at the sensor at rest: either sensor_sigma is too small, or the prior lacks an effect that the "
+                "fit takes for noise.",
             )  # fmt: skip
 
 
@@ -197,7 +210,8 @@ def _loops(results: Results) -> Iterator[Hint]:
     ms = None if isinstance(results.control, Absent) else results.control.step_ms
     if ms is not None and ms.p99 > ms.period:
         yield Hint(
-            "bad", f"Controller step time: the 99th percentile is {ms.p99:.3g} ms, but the period is {ms.period:g} ms.",
+            "bad", f"Controller step time: the 99th percentile is {ms.p99:.3g} ms of wall time, but the period "
+            f"is {ms.period:g} ms.",
             "Measure again on an idle computer. Else use the solver native (compiled C), a shorter horizon or a "
             "longer dt.",
         )  # fmt: skip

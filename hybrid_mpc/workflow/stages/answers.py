@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Answer, Verdict
+from hybrid_mpc.rules import counted
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.advice import EXPLAINED
 from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, closed_loops
@@ -45,7 +46,11 @@ def model_answer(results: Results) -> Answer:
     labels = list(own.rmse)
     lines += [_error_line(results, name, label) for label in labels[:SHOWN_OUTPUTS]]
     if more := len(labels) - SHOWN_OUTPUTS:
-        lines += [f"{more} more outputs are in section Free runs."] if more > 0 else []
+        lines += (
+            [f"{counted(more, 'more output is', 'more outputs are')} in section Free runs."]
+            if more > 0
+            else []
+        )
     hybrid = choice.candidates[choice.hybrid]
     if name == "phy" or not (math.isfinite(hybrid.ratio) and math.isfinite(hybrid.upper)):
         lines.append(f"{choice.reason.rstrip('.').capitalize()}.")
@@ -86,11 +91,11 @@ def controller_answer(results: Results) -> Answer:
         lines.append(one)
         bad |= wrong
     rows = () if isinstance(results.promises, Absent) else results.promises.rows
-    lines += [
-        f"Stability margins: {row.evidence}."
-        for row in rows
-        if row.name == "stability margins" and row.evidence
-    ]
+    for name, title in (
+        ("step time", "Step time under constant loads"),
+        ("stability margins", "Stability margins"),
+    ):
+        lines += [f"{title}: {row.evidence}." for row in rows if row.name == name and row.evidence]
     open_ = [row for row in rows if row.verdict != "shown"]
     if rows:
         lines.append(_promise_line(rows, open_))
@@ -138,9 +143,11 @@ def _time_lines(found: ControlResult | Absent) -> Iterator[tuple[str, bool]]:
     if isinstance(found, Absent):
         return
     ms = found.step_ms
-    late = f"{ms.misses} steps missed the deadline" if ms.misses else "No step missed its deadline"
+    where = "of the tasks' loops" if found.rows else "on recordings"
+    late = f"{counted(ms.misses, 'step')} missed the deadline" if ms.misses else "No step missed its deadline"
     yield (
-        f"{late}: 99 % of the steps take less than {ms.p99:.3g} ms; the period is {ms.period:g} ms.",
+        f"{late}: 99 % of the steps {where} take less than {ms.p99:.3g} ms of wall time; the period is "
+        f"{ms.period:g} ms.",
         ms.misses > 0,
     )
 
@@ -153,6 +160,9 @@ def monitor_answer(found: WatchResult | Absent) -> Answer:
     clean, wanted = found.clean, found.limits.false_alarms_per_hour
     many = clean.too_many(wanted)
     lines = [f"False alarms: {clean.words(wanted)}."]
+    if not found.limits.rated:
+        words = found.limits.words
+        lines = [f"False alarms: {clean.alarms} in {clean.seconds:.0f} s of undisturbed data; {words}."]
     faults = found.faults or ()
     seen = [row.delay_s for row in faults if row.delay_s is not None]
     if faults:

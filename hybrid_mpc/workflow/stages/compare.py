@@ -104,7 +104,7 @@ def parts_of(scenario: Scenario, tasks: Sequence[Task], budget: Budget, seeds: r
 
 @dataclass(frozen=True)
 class StepTimes:
-    """Durations of the hybrid controller's whole steps, from measurement to input [ms].
+    """Durations of the hybrid controller's whole steps, from measurement to input [ms of wall time].
 
     Args:
         median: Median.

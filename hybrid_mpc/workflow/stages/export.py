@@ -207,12 +207,12 @@ def observed(context: Context) -> dict[str, object]:
     """Everything of the scenario that the estimators of its loops depend on."""
     scenario, control = context.scenario, context.scenario.control
     return {
-        "sensors": (scenario.sensor_sigma, scenario.first_sigma),
+        "noise of sensors or first states": (scenario.sensor_sigma, scenario.first_sigma),
         "noise of the states": dict(scenario.state_noise),
-        "limits of the input": None if control is None else (control.u_min, control.u_max),
+        "limits of inputs": None if control is None else (control.u_min, control.u_max),
         "beyond recordings": scenario.beyond_recordings,
         "disturbance model": scenario.disturbance_model,
-        "weights of outputs": None if control is None else (control.q_y, control.horizon),
+        "weights of outputs or horizon": None if control is None else (control.q_y, control.horizon),
         "oracle": source_of(scenario.oracle),
     }
 

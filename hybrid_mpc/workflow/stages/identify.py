@@ -88,6 +88,7 @@ class DataResult:
         pieces: Number of trajectories by role.
         seconds: Their length [s] by role.
         warnings: Warnings about the recordings.
+        notes: How files were read that needed more than a plain table.
     """
 
     files: tuple[str, ...]
@@ -96,6 +97,7 @@ class DataResult:
     pieces: Mapping[str, int]
     seconds: Mapping[str, float]
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,8 @@ def data_stage(context: Context) -> DataResult:
     dataset, warnings = context.dataset, doubts(context)
     for warning in warnings:
         context.progress.warn(warning)
+    for note in dataset.notes:
+        context.progress.note(note)
     return DataResult(
         tuple(dataset.files),
         dataset.hash,
@@ -228,6 +232,7 @@ def data_stage(context: Context) -> DataResult:
         {role: len(context.trajectories(role)) for role in ROLES},
         {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in ROLES},
         warnings,
+        dataset.notes,
     )
 
 
@@ -245,7 +250,7 @@ def doubts(context: Context) -> tuple[str, ...]:
     Raises:
         InputError: If a recording is bad, or an input or output is constant in all training recordings.
     """
-    found = tuple(str(finding) for finding in context.dataset.findings)
+    found = context.dataset.warnings
     prior = context.scenario.prior()
     free = sum(not p.fixed for p in prior.parameters)
     train = context.trajectories("train")

@@ -19,6 +19,7 @@ from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
+from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
@@ -184,7 +185,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         (),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
-        advice(results, explained=_explained(context)),
+        advice(results, explained=_explained(context), declared=context.scenario.sensor_sigma),
         doubt_of(results.prior.in_doubt),
         answer_all(results),
     )
@@ -223,7 +224,10 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if absent:
         reasons = dict.fromkeys(one.reason for one in absent)
         after["estimation"] = (f"Observers were not tested: {'; '.join(reasons)}.",)
-    after["data"] = tuple(f"Warning: {text}" for text in results.data.warnings)
+    after["data"] = (
+        *(f"Warning: {text}" for text in results.data.warnings),
+        *(f"Note: {text}" for text in results.data.notes),
+    )
     replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
     lacking = "mopgrnn" not in models_of(context.scenario.prior())
     after["training"] = ((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()) + _prior_replay_text(
@@ -276,13 +280,15 @@ def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
         return (f"The monitor was not examined: {found.reason.rstrip('.')}.",)
     limits, clean = found.limits, found.clean
     rate, wanted = limits.false_alarms_per_hour, RATES[0] / limits.time_unit
-    learned = f"Limits were learned from {found.sources[found.kind]}, for {rate:g} false alarms an hour."
+    learned = f"Limits were learned from {found.sources[found.kind]}: {limits.words}."
     if not limits.rated:
-        learned = f"Limits are {limits.method}; they were learned from {found.sources[found.kind]}."
+        learned = (
+            f"Limits are {limits.method}; they were learned from {found.sources[found.kind]}: {limits.words}."
+        )
     elif rate > wanted:
         learned += (
-            f" Nominal data are too short for {wanted:g} an hour. Use a longer run (budget full), or recordings of the "
-            f"machine with hybrid-mpc monitor --learn {wanted:g}."
+            f" Nominal data are too short for {two_digits(wanted)} an hour. Use a longer run (budget full), or "
+            f"recordings of the machine with hybrid-mpc monitor --learn {two_digits(wanted)}."
         )
     verdict = "too many for these limits" if clean.too_many(rate) else "consistent with these limits"
     test = f"Alarms in the {clean.test_seconds:.0f} s of test data among them: {clean.test_alarms}."
@@ -321,7 +327,7 @@ def _data_table(data: DataResult) -> Table:
         (f"cut: {c.file}, {c.start_s:.2f} to {c.end_s:.2f} s: {c.why}", c.end_s - c.start_s)
         for c in data.cuts
     ]
-    caption = f"{len(data.files)} files; content hash {data.hash[:16]}."
+    caption = f"{counted(len(data.files), 'file')}; content hash {data.hash[:16]}."
     return Table(("part", "length [s]"), rows, caption)
 
 
@@ -600,7 +606,10 @@ def _varying_table(found: TrackResult) -> Table:
 
 def _timing_table(ms: StepTimes) -> Table:
     row = (ms.median, ms.p95, ms.p99, ms.max, ms.period, ms.misses)
-    return Table(("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,))
+    caption = "Wall time of whole steps. The promise of the step time is about processor time."
+    return Table(
+        ("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,), caption
+    )
 
 
 def _watch_tables(found: WatchResult) -> list[Table]:

@@ -20,6 +20,7 @@ from hybrid_mpc.kit.assembly import sensor_steps
 from hybrid_mpc.kit.parts import WatchFile, read_parts, write_watch
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import beside
+from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
 from hybrid_mpc.watch.explain import begun, explained
@@ -136,7 +137,7 @@ class CleanAlarms:
         """
         return (
             f"{self.alarms} in {self.seconds:.0f} s of undisturbed data; {self.expected(per_hour):.2g} are expected "
-            f"at {per_hour:g} false alarms an hour"
+            f"at {two_digits(per_hour)} false alarms an hour"
         )
 
 
@@ -377,7 +378,7 @@ def _loop_data(context: Context) -> Data:
         for name in ("y", "u"):
             content.update(np.ascontiguousarray(row.arrays[name], dtype="<f8").tobytes())
     minutes = sum(row.seconds for row in loops) / 60
-    source = f"{len(loops)} loops of the simulated machine under the hybrid MPC, {minutes:.1f} min"
+    source = f"{counted(len(loops), 'loop')} of the simulated machine under the hybrid MPC, {minutes:.1f} min"
     masks = [np.ones(len(r.t), dtype=bool) for r in records]
     return Data(records, masks, source, content.hexdigest(), tuple(loops))
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from scipy.stats import chi2
 
 from hybrid_mpc.report.page import Table
+from hybrid_mpc.rules import two_digits
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 
@@ -54,9 +55,7 @@ def rate_words(alarms: int, seconds: float) -> str:
     hours = seconds / 3600.0
     low = 0.5 * float(chi2.ppf(0.025, 2 * alarms)) / hours if alarms else 0.0
     high = 0.5 * float(chi2.ppf(0.975, 2 * alarms + 2)) / hours
-    rate, least, most = (
-        f"{float(f'{one:.2g}'):g}" for one in (alarms / hours, low, high)
-    )  # 170, not 1.7e+02
+    rate, least, most = map(two_digits, (alarms / hours, low, high))
     return f"{rate} ({least} to {most})"
 
 
