@@ -35,6 +35,7 @@ from hybrid_mpc.machine.terms import EXPLANATIONS
 from hybrid_mpc.model.equilibrium import Range, RateEquations, rate_search
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import known
+from hybrid_mpc.rules import counted
 from hybrid_mpc.scenario import Budget, Scenario, Task
 
 if TYPE_CHECKING:
@@ -240,9 +241,11 @@ def _check_recordings(
     report: Report, prior: Prior, recordings: Callable[[], Dataset], rest: Rest | None, spec: DataSpec
 ) -> Dataset | None:
     """Check that the recordings can be read, excite the machine, and cover the operating point."""
-    dataset = None
-    with report.part("recordings"):
+    dataset, read = None, Report()
+    with read.part("recordings"):
         dataset = recordings()
+    for problem in _each_once(read.problems, report.problems):
+        report.add(problem)
     if dataset is None:
         return None
     for doubtful in dataset.warnings:
@@ -274,6 +277,31 @@ def _check_recordings(
                         f"it is {value:.4g}. Record there, or correct the operating point or a unit"
                     )
     return dataset
+
+
+def _each_once(found: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Errors of recordings, each once: those of several files together, without ``known`` ones of the DataSpec.
+
+    Example:
+        >>> a, b = "recordings: a.csv: column 'u' is in 'K'", "recordings: b.csv: column 'u' is in 'K'"
+        >>> _each_once([a, b], [])
+        ["recordings: a.csv and 1 more file: column 'u' is in 'K'"]
+        >>> _each_once([a, b], ["data: column 'u' is in 'K'"])
+        []
+    """
+    files: dict[str, list[str]] = {}
+    for problem in found:
+        file, _, text = problem.removeprefix("recordings: ").partition(": ")
+        files.setdefault(text, []).append(file)
+    told = {problem.removeprefix("data: ") for problem in known}
+    return [
+        "recordings: "
+        + own[0]
+        + (f" and {counted(len(own) - 1, 'more file')}" if len(own) > 1 else "")
+        + (f": {text}" if text else "")
+        for text, own in files.items()
+        if not text or text not in told
+    ]
 
 
 def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:

@@ -67,6 +67,30 @@ def test_a_decimal_comma_that_is_read_is_a_note_and_no_warning(call, machine, tm
     assert "decimal comma" not in told.partition(" warning")[2]
 
 
+@pytest.mark.parametrize("unit", ["", " [rad]"])
+def test_swapped_columns_are_two_errors_however_many_files(call, machine, tmp_path, unit):
+    """Whether the names of the DataSpec hold the units, or the files alone."""
+    text = (machine / "my_machine.py").read_text()
+    torque, angle = f"tau{' [N m]' if unit else ''}", f"phi{unit}"
+    (tmp_path / "swapped.py").write_text(
+        text.replace('"tau_nm"', f'"{angle}"').replace('"phi_rad"', f'"{torque}"')
+    )
+    words = []
+    for name in ("monday", "tuesday"):
+        table = (
+            (machine / f"{name}.csv")
+            .read_text()
+            .replace("tau_nm", "tau [N m]")
+            .replace("phi_rad", "phi [rad]")
+        )
+        (tmp_path / f"{name}.csv").write_text(table)
+        words += ["--data", tmp_path / f"{name}.csv"]
+    code, told = checked(call, tmp_path / "swapped.py", *words)
+    assert code == 2
+    assert "2 errors" in told
+    assert told.count("[HM-DATA-128]") == 2
+
+
 def test_what_is_marked_is_counted_at_the_end(call, machine, tmp_path):
     text = (machine / "my_machine.py").read_text()
     for marks in (1, 2):
