@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -288,20 +289,21 @@ def _each_once(found: Sequence[str], known: Sequence[str]) -> list[str]:
         ["recordings: a.csv and 1 more file: column 'u' is in 'K'"]
         >>> _each_once([a, b], ["data: column 'u' is in 'K'"])
         []
+        >>> _each_once(["recordings raised TypeError: no", "recordings: none"], [])
+        ['recordings raised TypeError: no', 'recordings: none']
     """
     files: dict[str, list[str]] = {}
     for problem in found:
         file, _, text = problem.removeprefix("recordings: ").partition(": ")
-        files.setdefault(text, []).append(file)
+        of_file = problem.startswith("recordings: ") and text and Path(file).suffix
+        files.setdefault(text if of_file else problem, []).append(file if of_file else "")
     told = {problem.removeprefix("data: ") for problem in known}
-    return [
-        "recordings: "
-        + own[0]
-        + (f" and {counted(len(own) - 1, 'more file')}" if len(own) > 1 else "")
-        + (f": {text}" if text else "")
-        for text, own in files.items()
-        if not text or text not in told
-    ]
+    each = []
+    for text, (first, *others) in files.items():
+        more = f" and {counted(len(others), 'more file')}" if others else ""
+        if text not in told:
+            each.append(f"recordings: {first}{more}: {text}" if first else text)
+    return each
 
 
 def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
