@@ -68,12 +68,12 @@ def promises_stage(context: Context) -> PromisesResult | Absent:
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
     explained = context.find(EXPLAIN)
-    row = structure(
+    about_prior = structure(
         context.prior,
         context.read(CHOICE).choice,
         None if isinstance(explained, Absent) else explained.explanation,
     )
-    result = PromisesResult((row, *found), kit.identity)
+    result = PromisesResult((about_prior, *found), kit.identity)
     put_promises(context, result)
     return result
 
