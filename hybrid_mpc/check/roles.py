@@ -570,6 +570,7 @@ class _Judge:
                     self._say(trait, "disturbance", "no input affects it, and it affects outputs", False)
             elif (
                 trait.said == "quantity"
+                and trait.unit in ("degC", "degF", "K")  # of the surroundings
                 and free
                 and any(self.links.into(t, inputs) >= ACTS for t in outputs if t.said != "measured")
             ):

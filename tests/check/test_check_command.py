@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from hybrid_mpc.cli import check
+
 WITHOUT_TORCH = """
 import sys
 from hybrid_mpc.cli.main import app
@@ -109,3 +111,12 @@ def test_a_machine_in_casadi_is_checked_without_torch(machine):
     words = ["check", str(machine / "my_machine.py"), "--data", str(machine / "monday.csv")]
     done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("lacking", [(), ("k ends at its bound",)])
+def test_a_doubt_that_a_missing_term_explains_names_the_search(call, machine, monkeypatch, lacking):
+    monkeypatch.setattr(check, "_fit", lambda *given: ((), (), ("k ends at its bound",), lacking))
+    code, told, _ = call("check", machine / "my_machine.py", "--data", machine / "monday.csv", "--fit")
+    assert code == 0
+    assert ("hybrid-mpc explain" in told) == bool(lacking)
+    assert (str(machine / "monday.csv") in told.splitlines()[-1]) == bool(lacking)
