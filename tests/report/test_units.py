@@ -142,7 +142,7 @@ def test_a_loop_shows_every_output_with_its_reference_and_every_input_and_distur
         "front [degC]", "back [degC]", "error of front [degC]", "error of back [degC]", "heater [%]", "blower [%]",
         "time [s]", "room [degC]",
     ]  # fmt: skip
-    errors = results.control.hybrid.tracking_rmse
+    errors = results.control.tracking("hybrid_observer")
     assert set(errors) == {"front [degC]", "back [degC]"}
     assert all(0.0 < value < 10.0 for value in errors.values())
     assert "task controller RMSE of front [degC] RMSE of back [degC]" in text
