@@ -22,7 +22,7 @@ ROOMS = {
     "files": "nn_export errors records",
     "folder": "errors records files",
     "machine": "nn_export errors rules records",
-    "data": "nn_export errors records files machine",
+    "data": "nn_export errors rules records files machine",
     "model": "nn_export errors rules records machine",
     "estimate": "errors rules records machine model",
     "control": "nn_export errors rules records model estimate",
@@ -32,15 +32,15 @@ ROOMS = {
     "embedded": "nn_export errors rules files model estimate control loop watch",
     "kit": "nn_export errors rules records files machine data model estimate control embedded loop scenario watch",
     "identify": "nn_export errors rules records files machine data model estimate kit",
-    "plots": "errors files machine watch",
+    "plots": "errors rules files machine watch",
     "report": "errors rules files plots",
     "analyze": "nn_export errors records files machine data model estimate control loop watch plots report",
     "check": "nn_export errors rules engine records files machine data model control loop scenario kit identify plots "
     "analyze",
     "compare": "nn_export errors rules engine records files folder machine data model estimate control loop scenario "
     "watch kit identify plots report analyze check",
-    "workflow": "nn_export errors engine records files folder machine data model estimate control loop scenario watch "
-    "kit identify plots report analyze check compare",
+    "workflow": "nn_export errors rules engine records files folder machine data model estimate control loop scenario "
+    "watch kit identify plots report analyze check compare",
     "cli": "errors rules engine files machine data scenario kit identify analyze check compare workflow",
     "__main__": "cli",
     "scenarios.paper": "errors rules engine records files folder machine data scenario identify plots workflow cli",
