@@ -501,6 +501,11 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         parameters.append((name, min(max(value, low), high), unit, low, high, text))
         return f"p.{name}"
 
+    def time_constant(name: str, value: float) -> str:
+        seconds = float(_rounded(value))
+        low, high = float(_rounded(seconds / 20)), float(_rounded(seconds * 20))
+        return parameter(f"T_{name}", seconds, "s", low, high, "time constant")
+
     speeds: dict[str, tuple[str, Signal]] = {}  # second states by output: name and signal
     for name, column, lag in zip(y_names, draft.outputs, lags, strict=True):
         unit = column.unit or "-"
@@ -541,30 +546,14 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
             if lag.states == 1:
                 rates.append((f"{name}_moves", f"integrates: {INTEGRATES}"))
                 continue
-            late = float(_rounded(lag.seconds / (2 * lag.damping)))
-            constant = parameter(
-                f"T_{name}",
-                late,
-                "s",
-                float(_rounded(late / 20)),
-                float(_rounded(late * 20)),
-                "time constant",
-            )
+            constant = time_constant(name, lag.seconds / (2 * lag.damping))
             second[name] = f"({name}_moves - x.{{}}) / {constant}", f"{name} integrates: {INTEGRATES}"
             speeds[name] = _speed_of(
                 name, column, lag, draft.period, {*y_names, *(one for one, _ in speeds.values())}
             )
             rates.append((f"x.{speeds[name][0]}", f"exact: the derivative of {name}"))
             continue
-        seconds = float(_rounded(lag.seconds))
-        constant = parameter(
-            f"T_{name}",
-            seconds,
-            "s",
-            float(_rounded(seconds / 20)),
-            float(_rounded(seconds * 20)),
-            "time constant",
-        )
+        constant = time_constant(name, lag.seconds)
         damping = ""
         if lag.states == 2:
             bounded = float(_rounded(min(max(lag.damping, 0.01), 5.0)))

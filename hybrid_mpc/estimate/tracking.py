@@ -42,7 +42,7 @@ from hybrid_mpc.rules import Name, Positive
 
 Array = NDArray[np.float64]
 DAY = 86400.0
-"""Time [s] in which a tracked parameter returns to its fitted value if nothing tells of it."""
+"""Time [s] in which a tracked parameter returns to its fitted value without excitation."""
 FARTHEST = 3.0
 """Largest relative deviation of a parameter, as a logarithm, whose bound is zero."""
 NEAREST = 1e-6
