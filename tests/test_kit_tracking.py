@@ -78,3 +78,13 @@ def test_c_refuses_an_observer_that_tracks(kit, tmp_path):
     observer = kit.tracking_observer()
     with pytest.raises(hm.InputError, match=r"TrackingFilter.*HM-EMBEDDED-011"):
         write_controller(tmp_path / "c", observer.model, OCP, estimator=observer)
+
+
+@pytest.mark.parametrize("w", [[5e-5], [5e-5, np.nan], [[5e-5], [5e-5]]])
+def test_measured_disturbances_come_with_or_without_the_tracked_ones(kit, w):
+    loop = hm.Loop(kit.tracking_observer(), kit.controller(tracking=True), reference=[0.4])
+    loop.start(kit.models["prior"].x0[1:], w=w)
+    assert loop.n_measured == 1
+    assert loop.estimate.w[0] == 5e-5
+    with pytest.raises(hm.InputError, match="HM-MODEL-019"):
+        loop.step([0.3], w=[1.0, 2.0, 3.0])

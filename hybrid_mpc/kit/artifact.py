@@ -56,6 +56,7 @@ from hybrid_mpc.kit.parts import (
 from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.kit.promises import Promise, PromiseTable, none_made, read_promises
 from hybrid_mpc.loop.guard import Guard
+from hybrid_mpc.model.blend import BLEND_SHARE, blended, with_share
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import check_flag
@@ -522,6 +523,31 @@ class Kit:
     def with_tracked(self, tracked: Sequence[TrackedParameter]) -> Kit:
         """A kit whose :meth:`tracking_observer` tracks these parameters."""
         return replace(self, loop=replace(self.loop, tracked=tuple(tracked)))
+
+    def blended(self, share: float = 1.0, std: float = 0.3) -> Kit:
+        """A kit whose tracking observer runs prior and hybrid side by side and estimates the share of the correction.
+
+        Its hybrid is ``prior + share (hybrid - prior)`` (:func:`~hybrid_mpc.model.blend.blended`); the share, from 0 to
+        2, is one more tracked parameter. Where the machine has changed since the recordings, the correction may no
+        longer fit: the loop then uses less of it, or more.
+
+        Args:
+            share: Share that the observer starts with. Default: 1, the hybrid.
+            std: Standard deviation of the share. Default: 0.3, so that prior and hybrid are three deviations apart.
+
+        Raises:
+            InputError: If the kit has no hybrid, or the share is not inside 0 to 2.
+
+        Example:
+            ``kit = hm.load("runs/mine").blended()``;
+            ``loop = hm.Loop(kit.tracking_observer("hybrid"), kit.controller("hybrid", tracking=True))``
+        """
+        prior, hybrid = self._model("prior"), self._model("hybrid")
+        if not 0.0 < share < BLEND_SHARE.upper:
+            raise InputError(f"share: must be between 0 and {BLEND_SHARE.upper:g}, got {share} [HM-KIT-041]")
+        models = {"prior": with_share(prior, share), "hybrid": blended(prior, hybrid, share)}
+        tracked = (*self.loop.tracked, TrackedParameter(BLEND_SHARE.name, std))
+        return replace(self, models={**self.models, **models}).with_tracked(tracked)
 
     def _tracked(self) -> tuple[TrackedParameter, ...]:
         if not self.loop.tracked:

@@ -32,7 +32,7 @@ from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
 from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held, n_tracked, with_unknown
-from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
+from hybrid_mpc.model.limits import check_function, check_part, floats, sampled, whole
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -461,14 +461,17 @@ class Loop:
         """Measured disturbances ``(m, n_w)``, a row for the present and each known period; None if not measured."""
         if w is None:
             return None
-        given, columns = np.shape(w)[-1:], self.n_measured if self._tracked else self.model.n_w
-        columns = self.model.n_w if given == (self.model.n_w,) else columns
-        rows = sampled(w, (None, columns), "w, the measured disturbances and their forecast,")
+        name, n_w = "w, the measured disturbances and their forecast,", self.model.n_w
+        given: ArrayLike = w
+        if self._tracked:
+            given = floats(w, name)
+            n_w = n_w if given.shape[-1:] == (n_w,) else self.n_measured
+        rows = sampled(given, (None, n_w), name)
         if not len(rows):
             raise InputError(
                 "w: no rows; give the measured disturbances, or a row for each period ahead [HM-LOOP-022]"
             )
-        return rows if columns == self.model.n_w else with_unknown(rows, self._tracked)
+        return rows if n_w == self.model.n_w else with_unknown(rows, self._tracked)
 
     def _select_measured(self, measured: Array | None) -> dict[str, Array]:
         """Keyword argument ``w`` of the estimator; empty if the model has no measured disturbances."""

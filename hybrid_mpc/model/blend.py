@@ -14,15 +14,19 @@ from hybrid_mpc.machine.signals import Parameter
 from hybrid_mpc.model.model import HybridModel, ManyPoints, SideBySide, inlined, step_function, step_symbols
 
 Array = NDArray[np.float64]
-SHARE = Parameter("share", 1.0, "-", 0.0, 2.0, "share of the network's correction")
+BLEND_SHARE = Parameter("share", 1.0, "-", 0.0, 2.0, "share of the network's correction")
 """The blend's last parameter: 0 is the prior, 1 the hybrid. Its bounds are symmetric about the hybrid."""
 
 
-def blended(prior: HybridModel, hybrid: HybridModel) -> HybridModel:
+def blended(prior: HybridModel, hybrid: HybridModel, share: float = BLEND_SHARE.value) -> HybridModel:
     """The model ``x+ = f_prior + share (f_hybrid - f_prior)``, whose last parameter is the share of the correction.
 
-    Rates are blended likewise. The hidden state is the hybrid's; outputs and balances, which have no correction, too.
-    The default share is 1: with it the blend is the hybrid.
+    Rates are blended likewise. Outputs and balances have no correction. The hidden state is the hybrid's.
+
+    Args:
+        prior: The model without correction.
+        hybrid: The model with it.
+        share: Value of the parameter. Default: 1, the hybrid.
 
     Raises:
         InputError: If the models have other states, inputs, disturbances or parameters, or a parameter is named share.
@@ -44,7 +48,7 @@ def blended(prior: HybridModel, hybrid: HybridModel) -> HybridModel:
         )
     x, h, u, w, _ = step_symbols(hybrid)
     p = ca.MX.sym("p", hybrid.n_p + 1)
-    share, point = p[hybrid.n_p], [x, h, u, w, p]
+    part, point = p[hybrid.n_p], [x, h, u, w, p]
     own = [x, h, u, w, p[: hybrid.n_p]]
     queue = [
         x,
@@ -55,16 +59,16 @@ def blended(prior: HybridModel, hybrid: HybridModel) -> HybridModel:
     assert hybrid.with_jacobian is not None
     base, full = inlined(prior.with_jacobian, queue), inlined(hybrid.with_jacobian, own)
     n_x, n_q = hybrid.n_x, hybrid.n_x + prior.n_h
-    x_next = base[0] + share * (full[0] - base[0])
+    x_next = base[0] + part * (full[0] - base[0])
     padded = ca.horzcat(base[2][:n_x, :], ca.MX.zeros(n_x, hybrid.n_x + hybrid.n_h - n_q))
-    a = ca.vertcat(padded + share * (full[2][:n_x, :] - padded), full[2][n_x:, :])
-    b = ca.vertcat(base[3][:n_x, :] + share * (full[3][:n_x, :] - base[3][:n_x, :]), full[3][n_x:, :])
+    a = ca.vertcat(padded + part * (full[2][:n_x, :] - padded), full[2][n_x:, :])
+    b = ca.vertcat(base[3][:n_x, :] + part * (full[3][:n_x, :] - base[3][:n_x, :]), full[3][n_x:, :])
     rate, corrected = inlined(prior.xdot, queue)[0], inlined(hybrid.xdot, own)[0]
     return replace(
-        with_share(hybrid),
+        with_share(hybrid, share),
         name=f"{hybrid.name}, blended",
         step=step_function("step", point, [x_next, full[1]]),
-        xdot=ca.Function("xdot", point, [rate + share * (corrected - rate)]),
+        xdot=ca.Function("xdot", point, [rate + part * (corrected - rate)]),
         with_jacobian=step_function("with_jacobian", point, [x_next, full[1], ca.densify(a), ca.densify(b)]),
         side_by_side=None
         if hybrid.side_by_side is None or prior.side_by_side is None
@@ -72,15 +76,15 @@ def blended(prior: HybridModel, hybrid: HybridModel) -> HybridModel:
     )
 
 
-def with_share(model: HybridModel) -> HybridModel:
-    """The model with :data:`SHARE` as a further parameter that has no effect: it runs beside a blend.
+def with_share(model: HybridModel, share: float = BLEND_SHARE.value) -> HybridModel:
+    """The model with :data:`BLEND_SHARE` as a further parameter that has no effect: it stands beside a blend.
 
     Raises:
         InputError: If it has a parameter of this name.
     """
-    if SHARE.name in [p.name for p in model.parameters]:
+    if BLEND_SHARE.name in [p.name for p in model.parameters]:
         raise InputError(
-            f"blend: model {model.name} has a parameter named {SHARE.name}, which is the blend's. Rename it "
+            f"blend: model {model.name} has a parameter named {BLEND_SHARE.name}, which is the blend's. Rename it "
             "[HM-MODEL-061]"
         )
     x, h, u, w, _ = step_symbols(model)
@@ -105,7 +109,7 @@ def with_share(model: HybridModel) -> HybridModel:
         output=ca.Function("output", [x, u, w, p], inlined(model.output, [x, u, w, p[:n_p]])),
         with_jacobian=step_function("with_jacobian", point, inlined(model.with_jacobian, own)),
         side_by_side=None if base is None else make,
-        parameters=(*model.parameters, SHARE),
+        parameters=(*model.parameters, replace(BLEND_SHARE, value=share)),
         covariance=tuple(map(tuple, covariance.tolist())) if model.covariance else (),
         balances=tuple(
             replace(b, residual=ca.Function("residual", [x, rate, u, w, p],
