@@ -19,7 +19,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
-from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, with_tracked
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, tracked_range, with_tracked
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.kit.assembly import (
     make_adaptive_guard,
@@ -63,7 +63,7 @@ from hybrid_mpc.model.limits import check_flag
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
 from hybrid_mpc.records import known, plain
 from hybrid_mpc.scenario import Scenario
-from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.detector import ChannelLimit, WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
 from hybrid_mpc.watch.lengths import SHARE
 from hybrid_mpc.watch.monitor import Monitor, make_monitor, reads_energy
@@ -76,6 +76,8 @@ INPUTS = {
     "output": ("x", "u", "w", "p"),
     BALANCE: ("x", "xdot", "u", "w", "p"),
 }
+RELEASED = 0.9
+"""Share of a tracked parameter's limit at which its alarm ends."""
 OWN = ("step", "xdot")
 """Functions that each single network has of its own; the others are those of the hybrid."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
@@ -281,6 +283,22 @@ def _disturbed(
     """A model with the chosen disturbance model; the same object if it already has it."""
     model = models[name]
     return model if model.disturbance_model == chosen else replace(model, disturbance_model=chosen)
+
+
+def drift_limits(model: HybridModel, tracked: Sequence[TrackedParameter]) -> tuple[ChannelLimit, ...]:
+    """Limits of a model's tracked parameters: their distance from the fitted value at three standard deviations.
+
+    A parameter that drifts as it did between the recordings stays within them; beyond, the machine is another one, or
+    has a fault.
+    """
+    parameters = {p.name: p for p in model.parameters}
+    found = []
+    for one, low, high in zip(tracked, *tracked_range(model, tracked), strict=True):
+        p = parameters[one.name]
+        far = max(high - p.value, p.value - low)
+        if far > 0:
+            found.append(ChannelLimit(p.name, p.unit, 1, far, RELEASED * far))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -585,7 +603,7 @@ class Kit:
             *models, self.problem(task), solver=solver, iterations=iterations, safe_input=self.safe_input
         )
 
-    def monitor(self, model: str = "", *, kind: str = "", task: str = "") -> Monitor:
+    def monitor(self, model: str = "", *, kind: str = "", task: str = "", tracking: bool = False) -> Monitor:
         """The monitor of a loop or a recording, with the limits learned by the run.
 
         A mechanical model with measured positions is monitored by its energy, any other model by the residuals of its
@@ -597,15 +615,26 @@ class Kit:
                 with their limits; ``"own"``: the suitable readings without limits, so that it only alarms without a
                 valid reading. Default: ``"guard"``.
             task: Task whose control problem gives the inputs' ranges. Default: the common control problem.
+            tracking: For a loop with :meth:`tracking_observer`: readings use the tracked parameters, so that their
+                drift raises no alarm, and a parameter beyond three standard deviations does, by its name. The kind
+                ``"guard"`` then means residuals. Default: False.
 
         Raises:
-            InputError: If model, task or kind are unknown, limits are missing (all kinds but ``"own"``), or
-                ``"energy"`` is requested for a model without energy balance.
+            InputError: If model, task or kind are unknown, limits are missing (all kinds but ``"own"``),
+                ``"energy"`` is requested for a model without energy balance, or ``tracking`` is requested and the kit
+                names no tracked parameters.
         """
         watched = self._model(model)
         kind = known(_named(kind, "kind of monitor") or "guard", WATCHES, "kind of monitor")
         of = kind if kind in (ENERGY, RESIDUALS) else ""
+        check_flag(tracking, "tracking")
+        of = of or RESIDUALS if tracking else of
         limits = None if kind == "own" else self.limits(model, of)
+        if tracking:
+            watched = with_tracked(watched, self._tracked())
+            if limits is not None and limits.kind == RESIDUALS:
+                beyond = drift_limits(self._model(model), self._tracked())
+                limits = replace(limits, channels=(*limits.channels, *beyond))
         span = self.problem(task).input_range if self.loop.control or task else None
         rest = self.known_rest if limits is None else None
         return make_monitor(watched, limits, kind=of, rest_speed=rest, input_range=span)
