@@ -77,7 +77,8 @@ GAIN = 0.7
 with a large reduction does not widen the interval."""
 POOR = 0.7
 """Error [spreads] of a model that explains half of the outputs' variance. If the error with a term is larger, only a
-ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance."""
+ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance. The same holds where all
+evidence is one recording: its blocks do not show what differs in the next."""
 DOUBT = 0.1
 """Probability that the ratio lies beyond one end of its interval, for all fitted candidates of a step together. A term
 is added if the upper end is below 1."""
@@ -805,6 +806,11 @@ class _Explain:
             reason = f"the ratio to the model without it is {found.ratio:.2f} ({bound(found.upper)}): not significant"
             if more:
                 reason += f", {more} more recording{'s' * (more > 1)} like these would show it"
+        elif self.evidence.told.recordings == 1 and found.ratio > GAIN:
+            reason = (
+                f"the ratio to the model without it is {found.ratio:.2f}: blocks of one recording do not show whether "
+                "so small a gain holds in another one, record a second one"
+            )
         elif found.error > POOR and found.ratio > GAIN:
             reason = f"the error is {found.error:.2f} of the outputs' spread with it: so small a gain may be chance"
         elif untold:
