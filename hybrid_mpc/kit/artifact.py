@@ -78,6 +78,8 @@ INPUTS = {
 }
 RELEASED = 0.9
 """Share of a tracked parameter's limit at which its alarm ends."""
+ALMOST_PRIOR = 0.1
+"""Share of the correction with which a blend starts if the prior is recommended."""
 OWN = ("step", "xdot")
 """Functions that each single network has of its own; the others are those of the hybrid."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
@@ -542,7 +544,7 @@ class Kit:
         """A kit whose :meth:`tracking_observer` tracks these parameters."""
         return replace(self, loop=replace(self.loop, tracked=tuple(tracked)))
 
-    def blended(self, share: float = 1.0, std: float = 0.3) -> Kit:
+    def blended(self, share: float | None = None, std: float = 0.3) -> Kit:
         """A kit whose tracking observer runs prior and hybrid side by side and estimates the share of the correction.
 
         Its hybrid is ``prior + share (hybrid - prior)`` (:func:`~hybrid_mpc.model.blend.blended`); the share, from 0 to
@@ -550,7 +552,8 @@ class Kit:
         longer fit: the loop then uses less of it, or more.
 
         Args:
-            share: Share that the observer starts with. Default: 1, the hybrid.
+            share: Share that the observer starts with. Default: 1, the hybrid, if it is recommended; else 0.1, almost
+                the prior. At 0 it could not move.
             std: Standard deviation of the share. Default: 0.3, so that prior and hybrid are three deviations apart.
 
         Raises:
@@ -561,6 +564,8 @@ class Kit:
             ``loop = hm.Loop(kit.tracking_observer("hybrid"), kit.controller("hybrid", tracking=True))``
         """
         prior, hybrid = self._model("prior"), self._model("hybrid")
+        if share is None:
+            share = 1.0 if self.recommended == "hybrid" else ALMOST_PRIOR
         if not 0.0 < share < BLEND_SHARE.upper:
             raise InputError(f"share: must be between 0 and {BLEND_SHARE.upper:g}, got {share} [HM-KIT-041]")
         models = {"prior": with_share(prior, share), "hybrid": blended(prior, hybrid, share)}
