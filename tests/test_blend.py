@@ -65,7 +65,7 @@ def test_many_points_at_once_are_the_points_one_by_one(golf_artifact):
 def test_the_observer_finds_the_share_of_a_machine(true):
     prior, hybrid = pair()
     model = blended(prior, hybrid)
-    observer = TrackingFilter(make_filter(model, sigma_y=[1e-3]), [TrackedParameter("share", 0.5)])
+    observer = TrackingFilter(make_filter(model, sigma_y=[1e-3]), [TrackedParameter("correction_share", 0.5)])
     x, h, rng = np.zeros(2), np.zeros(3), np.random.default_rng(2)
     estimate = observer.start(x[:1])
     for k in range(1500):
