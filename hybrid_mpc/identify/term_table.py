@@ -76,7 +76,6 @@ Physical terms for [a prior of your own](mechanical-priors.md#friction-and-other
 ```python
 from hybrid_mpc import Parameter, terms
 
-drag = terms.quadratic("phi_dot", Parameter("c", 0.1, "N m s^2/rad^2", 0.0, 1.0))
 dry = terms.coulomb("phi_dot", Parameter("F", 0.2, "N m", 0.0, 1.0), width=0.05)
 ```
 
