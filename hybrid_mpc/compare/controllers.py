@@ -36,12 +36,14 @@ its last plan, and from the rival plan that is cheapest by its own equations."""
 class NamedController:
     """A controller of a ``"prior"``, ``"hybrid"`` or ``"oracle"`` model with its estimator.
 
-    With ``observer`` it estimates an unknown load at the input; with ``truth`` it gets the plant's true state.
+    With ``observer`` it estimates an unknown load at the input; with ``truth`` it gets the plant's true state. With
+    ``blended`` it runs prior and hybrid side by side and estimates the share of the network's correction.
     """
 
     model: str
     observer: bool = False
     truth: bool = False
+    blended: bool = False
 
 
 CONTROLLERS: Mapping[str, NamedController] = {
@@ -49,15 +51,23 @@ CONTROLLERS: Mapping[str, NamedController] = {
     "prior_observer": NamedController("prior", observer=True),
     "hybrid": NamedController("hybrid"),
     "hybrid_observer": NamedController("hybrid", observer=True),
+    "blended_observer": NamedController("hybrid", observer=True, blended=True),
     "oracle": NamedController("oracle", observer=True),
     "oracle_state": NamedController("oracle", truth=True),
 }
-"""Fitted prior and hybrid, each without and with disturbance observer; two oracles with the plant's own equations, one
-with the same measurements and the same kind of estimator, one with the true state."""
+"""Fitted prior and hybrid, each without and with disturbance observer; their blend; two oracles with the plant's own
+equations, one with the same measurements and the same kind of estimator, one with the true state."""
 ORACLES = ("oracle", "oracle_state")
+COMPARED = tuple(name for name, c in CONTROLLERS.items() if not c.blended)
+"""Controllers that a run compares."""
 OBSERVERS = ("prior_observer", "hybrid_observer")
 LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
 """Controller whose process noise is a lower bound, for scenarios whose tasks go beyond the recordings."""
+
+
+def noise_name(controller: str) -> str:
+    """The controller whose process noise a controller uses; the blend's is that of the hybrid."""
+    return "hybrid_observer" if CONTROLLERS[controller].blended else controller
 
 
 def build(
@@ -69,6 +79,10 @@ def build(
         InputError: If the controller is unknown, the scenario has no oracle, or the kit has no noise.
     """
     c, prior = CONTROLLERS[known(name, CONTROLLERS, "controller")], kit.models["prior"]
+    if c.blended:
+        own = kit.blended()
+        problem = replace(own, loop=replace(own.loop, control={"": control}))
+        return problem.tracking_observer("hybrid"), problem.controller("hybrid", solver=solver, tracking=True)
     if c.model != "oracle":
         model = kit.models[c.model]
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
@@ -104,7 +118,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
             models[c.model], scenario, errors[c.model], recordings, observer=c.observer, known=scenario.state_noise
         )
         for name, c in CONTROLLERS.items()
-        if c.model in models and not c.truth
+        if c.model in models and not c.truth and not c.blended
     }  # fmt: skip
     return no_surer_than_prior(scenario, found)
 
@@ -146,7 +160,7 @@ def find_noise(
     Example:
         ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
     """
-    needed = [name for name in controllers if not CONTROLLERS[name].truth]
+    needed = list(dict.fromkeys(noise_name(name) for name in controllers if not CONTROLLERS[name].truth))
     held = {name: artifact.noise(name) for name in artifact.loop.process_noise}
     lacking = [name for name in needed if name not in held]
     if not lacking:

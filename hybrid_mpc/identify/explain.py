@@ -831,7 +831,10 @@ class _Explain:
         terms = (*self.now.terms, *pair.forms)
         for form in pair.forms:
             kept, theta = self.search.without(terms, pair.theta, form)
-            alone = self.search.held_out(kept, theta)
+            try:
+                alone = self.search.held_out(kept, theta)
+            except (InputError, np.linalg.LinAlgError):
+                continue  # without this term the model cannot be simulated in every fold
             if self.evidence.compared(pair.squares, alone, 1).ratio >= WORTH:
                 return False
         return True
@@ -872,8 +875,11 @@ class _Explain:
                 if term.name in newest:
                     continue
                 kept, theta = self.search.without(self.now.terms, self.now.theta, term)
-                fitted = self.search.begun(kept, theta)
-                squares = self.search.held_out(kept, fitted.theta)
+                try:
+                    fitted = self.search.begun(kept, theta)
+                    squares = self.search.held_out(kept, fitted.theta)
+                except (InputError, np.linalg.LinAlgError):
+                    continue  # without this term the model cannot be simulated in every fold
                 found = self.evidence.compared(squares, self.now.squares, 1)
                 if least is None or found.ratio < least[0].ratio:
                     least = found, term, _State(kept, fitted.theta, squares)

@@ -48,6 +48,7 @@ _ROLES = {
     "mopgrnn": ("#D55E00", "MOPGRNN"),
     "hybrid": ("#D55E00", "hybrid"),
     "hybrid_observer": ("#E69F00", "hybrid with observer"),
+    "blended_observer": ("#882255", "blend with observer"),
     "oracle": ("#CC79A7", "oracle"),
     "oracle_state": ("#009E73", "oracle, true state"),
     "train": ("#56B4E9", "training"),
