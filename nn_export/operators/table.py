@@ -27,7 +27,7 @@ This page is generated: `python -m nn_export.operators.table > docs/operators.md
 NOTES: dict[str, str] = {
     "_to_copy": "conversion to an integer type truncates",
     "atan2": "not finite at (0, 0)",
-    "detach": "derivatives pass",
+    "detach": "does not stop derivatives",
     "maximum minimum": "do not pass NaN on",
     "where": "NaN of the other branch is not passed on",
     "arange": "float32: only numbers that are exact in it",
