@@ -112,3 +112,16 @@ def test_a_share_at_its_bound_could_not_move(kit, share):
 def test_the_guard_needs_a_hybrid_that_its_monitor_watches():
     with pytest.raises(hm.InputError, match="HM-COMPARE-003"):
         LoopSpec("golf_robot", "model", "track_step", "blended_observer", guard="rest")
+
+
+def test_a_controller_of_studies_tracks_the_parameters_of_the_kit(kit):
+    scenario, spec = (
+        hm.load_scenario("golf_robot"),
+        LoopSpec("golf_robot", "model", "track_step", "hybrid_tracking", duration=0.4),
+    )
+    with pytest.raises(hm.InputError, match="HM-KIT-040"):
+        Bench(scenario, {"model": kit}).run(spec)
+    tracked = [TrackedParameter("mu", 0.1, relative=True)]
+    result = Bench(scenario, {"model": kit.with_tracked(tracked)}).run(spec)[1]
+    assert set(result.status) == {"SOLVED"}
+    assert np.ptp(result.w[:, 0]) > 0.0

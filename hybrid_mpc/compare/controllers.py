@@ -37,13 +37,19 @@ class NamedController:
     """A controller of a ``"prior"``, ``"hybrid"`` or ``"oracle"`` model with its estimator.
 
     With ``observer`` it estimates an unknown load at the input; with ``truth`` it gets the plant's true state. With
-    ``blended`` it runs prior and hybrid side by side and estimates the share of the network's correction.
+    ``tracking`` it also estimates the kit's tracked parameters, with ``blended`` the share of the network's correction.
     """
 
     model: str
     observer: bool = False
     truth: bool = False
+    tracking: bool = False
     blended: bool = False
+
+    @property
+    def compared(self) -> bool:
+        """Whether every run compares it, and a monitor of the hybrid's limits can watch it."""
+        return not (self.tracking or self.blended)
 
 
 CONTROLLERS: Mapping[str, NamedController] = {
@@ -51,14 +57,17 @@ CONTROLLERS: Mapping[str, NamedController] = {
     "prior_observer": NamedController("prior", observer=True),
     "hybrid": NamedController("hybrid"),
     "hybrid_observer": NamedController("hybrid", observer=True),
+    "prior_tracking": NamedController("prior", observer=True, tracking=True),
+    "hybrid_tracking": NamedController("hybrid", observer=True, tracking=True),
     "blended_observer": NamedController("hybrid", observer=True, blended=True),
     "oracle": NamedController("oracle", observer=True),
     "oracle_state": NamedController("oracle", truth=True),
 }
-"""Fitted prior and hybrid, each without and with disturbance observer; their blend; two oracles with the plant's own
-equations, one with the same measurements and the same kind of estimator, one with the true state."""
+"""Fitted prior and hybrid: each without and with disturbance observer, and with tracked parameters; their blend; two
+oracles with the plant's own equations, one with the same measurements and the same kind of estimator, one with the true
+state."""
 ORACLES = ("oracle", "oracle_state")
-COMPARED = tuple(name for name, c in CONTROLLERS.items() if not c.blended)
+COMPARED = tuple(name for name, c in CONTROLLERS.items() if c.compared)
 """Controllers that a run compares."""
 OBSERVERS = ("prior_observer", "hybrid_observer")
 LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
@@ -66,8 +75,9 @@ LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_o
 
 
 def noise_name(controller: str) -> str:
-    """The controller whose process noise a controller uses; the blend's is that of the hybrid."""
-    return "hybrid_observer" if CONTROLLERS[controller].blended else controller
+    """The controller whose process noise a controller uses: the observer of the same model."""
+    own = CONTROLLERS[controller]
+    return controller if own.compared else f"{own.model}_observer"
 
 
 def build(
@@ -79,10 +89,10 @@ def build(
         InputError: If the controller is unknown, the scenario has no oracle, or the kit has no noise.
     """
     c, prior = CONTROLLERS[known(name, CONTROLLERS, "controller")], kit.models["prior"]
-    if c.blended:
-        own = kit.blended()
-        problem = replace(own, loop=replace(own.loop, control={"": control}))
-        return problem.tracking_observer("hybrid"), problem.controller("hybrid", solver=solver, tracking=True)
+    if not c.compared:
+        own = kit.blended() if c.blended else kit
+        own = replace(own, loop=replace(own.loop, control={"": control}))
+        return own.tracking_observer(c.model), own.controller(c.model, solver=solver, tracking=True)
     if c.model != "oracle":
         model = kit.models[c.model]
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
@@ -118,7 +128,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
             models[c.model], scenario, errors[c.model], recordings, observer=c.observer, known=scenario.state_noise
         )
         for name, c in CONTROLLERS.items()
-        if c.model in models and not c.truth and not c.blended
+        if c.model in models and not c.truth and c.compared
     }  # fmt: skip
     return no_surer_than_prior(scenario, found)
 

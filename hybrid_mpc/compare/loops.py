@@ -282,7 +282,7 @@ class LoopRow:
 def _is_watched(controller: str) -> bool:
     """Whether a monitor can watch a controller: it watches the hybrid."""
     own = CONTROLLERS[controller]
-    return own.model == "hybrid" and not own.blended
+    return own.model == "hybrid" and own.compared
 
 
 class Bench:

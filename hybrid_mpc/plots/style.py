@@ -48,6 +48,8 @@ _ROLES = {
     "mopgrnn": ("#D55E00", "MOPGRNN"),
     "hybrid": ("#D55E00", "hybrid"),
     "hybrid_observer": ("#E69F00", "hybrid with observer"),
+    "prior_tracking": ("#117733", "prior, tracking"),
+    "hybrid_tracking": ("#999933", "hybrid, tracking"),
     "blended_observer": ("#882255", "blend with observer"),
     "oracle": ("#CC79A7", "oracle"),
     "oracle_state": ("#009E73", "oracle, true state"),
