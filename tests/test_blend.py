@@ -65,7 +65,7 @@ def test_many_points_at_once_are_the_points_one_by_one(golf_artifact):
 def test_the_observer_finds_the_share_of_a_machine(true):
     prior, hybrid = pair()
     model = blended(prior, hybrid)
-    observer = TrackingFilter(make_filter(model, sigma_y=[1e-3]), [TrackedParameter("share", 0.5)])
+    observer = TrackingFilter(make_filter(model, sigma_y=[1e-3]), [TrackedParameter("correction_share", 0.5)])
     x, h, rng = np.zeros(2), np.zeros(3), np.random.default_rng(2)
     estimate = observer.start(x[:1])
     for k in range(1500):
@@ -101,6 +101,13 @@ def test_a_kit_runs_prior_and_hybrid_side_by_side(kit):
     assert result.w.shape == (50, 1)
     assert result.w[0, 0] == 1.0
     assert np.ptp(result.w) > 0.0
+
+
+def test_a_kit_that_recommends_the_prior_asks_for_a_start(kit):
+    careful = replace(kit, recommended="prior")
+    with pytest.raises(hm.InputError, match="HM-KIT-042"):
+        careful.blended()
+    assert careful.blended(0.5).models["hybrid"].p[-1] == 0.5
 
 
 @pytest.mark.parametrize("share", [0.0, 2.0, np.nan])

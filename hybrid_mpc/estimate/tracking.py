@@ -194,6 +194,12 @@ def _side_by_side(base: SideBySide, n_w: int, places: Sequence[int]) -> SideBySi
     return make
 
 
+def shown_parameters(model: HybridModel) -> tuple[str, ...]:
+    """Names of the parameters in the output equation, which cannot be tracked."""
+    _, places = model.output.jac_sparsity(0, 3).get_triplet()
+    return tuple(model.parameters[i].name for i in sorted(set(places)))
+
+
 def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> HybridModel:
     """The model of the observer: deviations ``theta`` of the tracked parameters are the last hidden states.
 
@@ -203,8 +209,8 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
     _check(model, tracked)
     places, n_h = _places(model, tracked), model.n_h
     x, _, u, w, p = step_symbols(model)
-    _, shown = model.output.jac_sparsity(0, 3).get_triplet()
-    if names := [model.parameters[i].name for i in places if i in shown]:
+    shown = shown_parameters(model)
+    if names := [one.name for one in tracked if one.name in shown]:
         raise InputError(
             f"tracked parameters: {', '.join(names)} appear in the output equation of model {model.name}, which is not "
             "supported. Declare a disturbance of the output instead (disturbance_model), or Parameter(..., "

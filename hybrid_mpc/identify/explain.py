@@ -69,7 +69,10 @@ STEPS = 8
 ITERATIONS = 12
 """Gauss-Newton steps of a fit that starts near the optimum."""
 WORTH = 0.95
-"""Ratio of errors that a term must fall below: a smaller reduction is not worth a parameter."""
+"""Ratio of errors that a term must fall below to be needed beside another one, or an alternative to it."""
+ADDED = 0.85
+"""Ratio of errors that a term must fall below to be added. Smaller held-out gains became harm on another recording as
+often as gain (docs/results/explain.md), and a term costs its reader attention."""
 HARM = 1.05
 """Ratio of errors above which a term is harmful."""
 GAIN = 0.7
@@ -77,7 +80,8 @@ GAIN = 0.7
 with a large reduction does not widen the interval."""
 POOR = 0.7
 """Error [spreads] of a model that explains half of the outputs' variance. If the error with a term is larger, only a
-ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance."""
+ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance. The same holds where all
+evidence is one recording: its blocks do not show what differs in the next."""
 DOUBT = 0.1
 """Probability that the ratio lies beyond one end of its interval, for all fitted candidates of a step together. A term
 is added if the upper end is below 1."""
@@ -797,14 +801,19 @@ class _Explain:
         reason = ""
         if not np.isfinite(squares).all():
             return _Fitted(forms, None, theta, squares, "its free runs diverge")
-        if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
-            less = "" if found.ratio >= WORTH else ", but the error over all samples is not smaller"
+        if found.ratio >= ADDED or squares.sum() >= self.now.squares.sum():
+            less = "" if found.ratio >= ADDED else ", but the error over all samples is not smaller"
             reason = f"the ratio to the model without it is {found.ratio:.2f}{less}"
         elif found.upper >= 1.0:
             more = self.evidence.needed(squares, self.now.squares, candidates)
             reason = f"the ratio to the model without it is {found.ratio:.2f} ({bound(found.upper)}): not significant"
             if more:
                 reason += f", {more} more recording{'s' * (more > 1)} like these would show it"
+        elif self.evidence.told.recordings == 1 and found.ratio > GAIN:
+            reason = (
+                f"the ratio to the model without it is {found.ratio:.2f}: blocks of one recording do not show whether "
+                "so small a gain holds in another one, record a second one"
+            )
         elif found.error > POOR and found.ratio > GAIN:
             reason = f"the error is {found.error:.2f} of the outputs' spread with it: so small a gain may be chance"
         elif untold:

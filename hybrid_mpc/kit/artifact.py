@@ -542,7 +542,7 @@ class Kit:
         """A kit whose :meth:`tracking_observer` tracks these parameters."""
         return replace(self, loop=replace(self.loop, tracked=tuple(tracked)))
 
-    def blended(self, share: float = 1.0, std: float = 0.3) -> Kit:
+    def blended(self, share: float | None = None, std: float = 0.3) -> Kit:
         """A kit whose tracking observer runs prior and hybrid side by side and estimates the share of the correction.
 
         Its hybrid is ``prior + share (hybrid - prior)`` (:func:`~hybrid_mpc.model.blend.blended`); the share, from 0 to
@@ -550,17 +550,24 @@ class Kit:
         longer fit: the loop then uses less of it, or more.
 
         Args:
-            share: Share that the observer starts with. Default: 1, the hybrid.
+            share: Share that the observer starts with. Default: 1, the hybrid, if the hybrid is recommended.
             std: Standard deviation of the share. Default: 0.3, so that prior and hybrid are three deviations apart.
 
         Raises:
-            InputError: If the kit has no hybrid, or the share is not inside 0 to 2.
+            InputError: If the kit has no hybrid, the share is not inside 0 to 2, or the prior is recommended and no
+                share is given.
 
         Example:
             ``kit = hm.load("runs/mine").blended()``;
             ``loop = hm.Loop(kit.tracking_observer("hybrid"), kit.controller("hybrid", tracking=True))``
         """
         prior, hybrid = self._model("prior"), self._model("hybrid")
+        if share is None and self.recommended != "hybrid":
+            raise InputError(
+                f"{self._whose}: the prior is recommended, so nothing shows that the correction helps, and a blend may "
+                "do harm (docs/results/tracking.md). Use kit.observer(), or give share= [HM-KIT-042]"
+            )
+        share = BLEND_SHARE.value if share is None else share
         if not 0.0 < share < BLEND_SHARE.upper:
             raise InputError(f"share: must be between 0 and {BLEND_SHARE.upper:g}, got {share} [HM-KIT-041]")
         models = {"prior": with_share(prior, share), "hybrid": blended(prior, hybrid, share)}

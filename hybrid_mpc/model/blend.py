@@ -14,7 +14,7 @@ from hybrid_mpc.machine.signals import Parameter
 from hybrid_mpc.model.model import HybridModel, ManyPoints, SideBySide, inlined, step_function, step_symbols
 
 Array = NDArray[np.float64]
-BLEND_SHARE = Parameter("share", 1.0, "-", 0.0, 2.0, "share of the network's correction")
+BLEND_SHARE = Parameter("correction_share", 1.0, "-", 0.0, 2.0, "share of the network's correction")
 """The blend's last parameter: 0 is the prior, 1 the hybrid. Its bounds are symmetric about the hybrid."""
 
 
@@ -29,7 +29,8 @@ def blended(prior: HybridModel, hybrid: HybridModel, share: float = BLEND_SHARE.
         share: Value of the parameter. Default: 1, the hybrid.
 
     Raises:
-        InputError: If the models have other states, inputs, disturbances or parameters, or a parameter is named share.
+        InputError: If the models have other states, inputs, disturbances or parameters, or a parameter has the name of
+            :data:`BLEND_SHARE`.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal
