@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.machine.specification import BenchmarkSpec, ChoiceRule, Count, CountOrNone, DataSpec
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.records import Fields
-from hybrid_mpc.rules import Line, Name, NotNegative, Number, Seconds, Text
+from hybrid_mpc.rules import Line, Name, NotNegative, Number, Positive, Seconds, Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -193,9 +194,12 @@ class Scenario:
             ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Default, if no law is named: all
             laws, besides the own terms.
         choice: How sure held-out data must show that a hybrid is better than the fitted prior. Default: 95 %.
+        false_alarms_per_hour: Wanted rates of the monitor's false alarms [1/h], in rising order; limits are learned for
+            the first rate that the undisturbed data are long enough for. A machine that stops at an alarm needs lower
+            rates, and longer recordings. Default: 1, 2, 5 and 10, over the machine's time unit [s].
 
     Raises:
-        InputError: With all fields of a wrong kind, and equal names of tasks.
+        InputError: With all fields of a wrong kind, equal names of tasks, and rates that do not rise.
 
     Example:
         >>> spec = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
@@ -226,6 +230,7 @@ class Scenario:
     disturbance_model: tuple[Disturbance, ...] | None = None
     terms: tuple[Term | Name, ...] = ()
     choice: ChoiceRule = field(default_factory=ChoiceRule)
+    false_alarms_per_hour: tuple[Positive, ...] = ()
 
     def __post_init__(self) -> None:
         own = Fields(self, f"scenario {self.name!r}")
@@ -233,6 +238,11 @@ class Scenario:
             "control",
             lambda: _is_problem(self.control),
             f"control: must be OCP(...), got {self.control!r:.60} [HM-SCENARIO-002]",
+        )
+        own.need(
+            "false_alarms_per_hour",
+            lambda: all(one < two for one, two in pairwise(self.false_alarms_per_hour)),
+            f"false_alarms_per_hour: rates must rise, got {self.false_alarms_per_hour} [HM-SCENARIO-011]",
         )
         own.distinct("tasks", lambda: [task.name for task in self.tasks], "tasks: the name")
         own.refuse()

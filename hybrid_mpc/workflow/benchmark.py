@@ -72,8 +72,6 @@ not determine speed and acceleration. Whole recordings with a shorter warm-up (E
 REFIT_LENGTHS = (0.5, 1.0, 3.0)
 """Lengths of the free runs of a refit [time constants of the machine], the short ones first: from a bad start, the fit
 of long runs does not converge. Short runs alone spend most of the data on their initial states."""
-FEWEST_RUNS = 3
-"""Smallest number of free runs of a refit: a single run would be fitted by many parameters."""
 
 
 @dataclass(frozen=True)
@@ -531,7 +529,8 @@ def refitted(
         InputError: If the recording is not longer than ``seconds``, or ``seconds`` is too short for a fit.
     """
     lengths = [time_unit([trajectory], dt) * own for own in REFIT_LENGTHS]
-    n, least = round(seconds / dt), FEWEST_RUNS * lengths[0]
+    # smallest number of free runs of a refit: a single run would be fitted by many parameters
+    n, least = round(seconds / dt), 3 * lengths[0]
     if n >= len(trajectory.t) - 1 or seconds < least:
         raise InputError(
             f"{trajectory.name}: a refit of {seconds:g} s is not possible. It needs at least {least:g} s and less than "

@@ -133,7 +133,7 @@ PLANTED = {
         "HM-MACHINE-008",
     ),
     "a disturbance without a column": (
-        lambda: replace(KETTLE, data=replace(KETTLE.data, disturbances=())), "HM-CHECK-016",
+        lambda: replace(KETTLE, data=replace(KETTLE.data, disturbances=())), "HM-DATA-129",
     ),
     "a column in a unit of something else": (
         lambda: replace(KETTLE, data=replace(KETTLE.data, outputs=("level [kg]", "warmth"))), "HM-DATA-128",
