@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError, no_exit, said_by
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.signals import Parameter, Signal
-from hybrid_mpc.machine.specification import BenchmarkSpec, ChoiceRule, Count, CountOrNone, DataSpec
+from hybrid_mpc.machine.specification import (
+    BenchmarkBudget,
+    BenchmarkSpec,
+    ChoiceRule,
+    Count,
+    CountOrNone,
+    DataSpec,
+)
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Line, Name, NotNegative, Number, Positive, Seconds, Text
@@ -110,37 +117,23 @@ class Task:
         own.refuse()
 
 
-@dataclass(frozen=True)
-class Budget:
-    """Effort of one run of the main job.
+@dataclass(frozen=True, kw_only=True)
+class Budget(BenchmarkBudget):
+    """Effort of one run of the main job: of its training, and of its closed loops.
 
     Args:
-        hidden: Hidden units of each network.
-        networks: Networks trained per model, each without another part of the data. Their mean is deployed: one network
-            of ``networks * hidden`` hidden units z, which determines the time of a control step.
-        teacher_steps: Optimiser steps with teacher forcing.
-        free_run_steps: Optimiser steps on free runs.
         seeds: Most closed loops per task and controller; fewer if they suffice to distinguish the controllers' costs.
         oracle_seeds: Most closed loops per task of the oracles, which are slow; never more than of the others.
         tasks: Names of the tasks to run. Default: all.
-        decay: Weight decay times the number of training samples: fewer samples need more decay against overfitting.
-            Default: 300.
-        prior_replay: Weight that fades corrections where nothing was measured (``TrainingSettings``), for a machine
-            whose tasks leave the range of its recordings. Default: zero.
+
+    Example:
+        >>> Budget(8, 4, 200, 200, seeds=2).horizon
+        50
     """
 
-    hidden: Count
-    networks: Count
-    teacher_steps: CountOrNone
-    free_run_steps: CountOrNone
     seeds: Count
-    decay: NotNegative = 300.0
     oracle_seeds: CountOrNone = 1
     tasks: tuple[Name, ...] | None = None
-    prior_replay: NotNegative = 0.0
-
-    def __post_init__(self) -> None:
-        Fields(self, "budget").refuse()
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {

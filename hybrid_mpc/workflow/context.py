@@ -98,7 +98,7 @@ class Context:
         return budgets[self.settings.budget]
 
     @property
-    def effort(self) -> Budget | BenchmarkBudget:
+    def effort(self) -> BenchmarkBudget:
         """Effort of the training."""
         return self.budget
 

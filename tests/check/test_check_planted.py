@@ -76,7 +76,7 @@ class Plant(StatePlant):
         return np.array([state[0] + dt * v, v])
 
 
-BUDGET = {"quick": Budget(4, 1, 5, 5, 1)}
+BUDGET = {"quick": Budget(4, 1, 5, 5, seeds=1)}
 KETTLE = Scenario(
     "kettle", "Kettle", "", prior=Kettle, budgets=BUDGET,
     data=DataSpec("t", ("inflow", "heat"), ("level", "warmth"), dt=0.5, max_gap=2.0, smoothing=5.0, warm_up=5.0,

@@ -54,6 +54,7 @@ from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.structure import causes, causes_of_refusal, named
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import beside, plain, record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.workflow.context import Context
@@ -588,7 +589,7 @@ def runs_of(
 def training_settings(context: Context, kind: str) -> TrainingSettings:
     """Training settings of a kind: those of the budget, replaced by those of the run's settings file."""
     effort = context.effort
-    own = {f.name: getattr(effort, f.name) for f in fields(TrainingSettings) if hasattr(effort, f.name)}
+    own = {f.name: getattr(effort, f.name) for f in fields(BenchmarkBudget)}
     settings = TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
         seed=context.settings.seed,
