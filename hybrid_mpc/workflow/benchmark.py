@@ -324,7 +324,8 @@ def benchmark(
     check_scenario(replace(scenario, plant=None))  # a benchmark runs no closed loop
     data, tests, warnings = _read(settings, scenario)
     for warning in warnings:
-        progress.warn(warning)
+        if data is None or warning not in data.dataset.warnings:  # stage data tells those
+            progress.warn(warning)
     if data is None:
         context = _finished(settings, scenario, progress)
         check_writable(out)
