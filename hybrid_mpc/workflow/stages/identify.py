@@ -259,7 +259,7 @@ def doubts(context: Context) -> tuple[str, ...]:
         return found
     return (
         *found,
-        *short_runs(context.spec, context.trajectories("test")),
+        *short_runs(context.scenario.data, context.trajectories("test")),
         *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
     )
 
