@@ -19,7 +19,6 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import stage_step
 
 Array = NDArray[np.float64]
-NAN = float("nan")
 FEASIBLE = 1e-6
 """Largest defect, and largest violation of a limit over its range, of an accepted solution."""
 
@@ -103,7 +102,7 @@ class IpoptController(Controller):
         z = np.vstack([np.concatenate([estimate.x, estimate.h]), z[2:], z[-1:]])
         added = self.model.acting(np.zeros_like(u), estimate.d, target.w)
         rows = (added, target.x, target.weight, target.u)
-        failed = self._plan(u, z, target, NAN, Status.NOT_FINITE, NAN, start, 0)
+        failed = self._plan(u, z, target, np.nan, Status.NOT_FINITE, np.nan, start, 0)
         if not (target.ok and all(np.all(np.isfinite(v)) for v in (*rows, z, u, u_prev))):
             return failed
         p = target.p[:, : problem.economic.n_p]
@@ -123,7 +122,7 @@ class IpoptController(Controller):
             if violated <= FEASIBLE:
                 break
         if not violated <= FEASIBLE:
-            return self._plan(u, z, target, NAN, Status.NLP_FAILED, kkt, start, count)
+            return self._plan(u, z, target, np.nan, Status.NLP_FAILED, kkt, start, count)
         status = Status.SOLVED if stats["success"] or kkt <= FEASIBLE else Status.STOPPED
         found = found * self._scale
         u = np.clip(found[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))

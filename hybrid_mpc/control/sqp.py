@@ -154,7 +154,6 @@ class ReducedCost:
         return rest
 
 
-NAN = float("nan")
 KKT = 1e-6
 MORE = 4.0
 """Factor by which damping grows between attempts, and falls after a good step."""
@@ -191,7 +190,7 @@ class Descent:
     ) -> None:  # fmt: skip
         self._cost, self._case, self._tolerance = cost, case, tolerance
         self.at, self.curvature, self.active = at, curvature, active
-        self.count, self.status, self.kkt, self.ended = 0, Status.STOPPED, NAN, False
+        self.count, self.status, self.kkt, self.ended = 0, Status.STOPPED, np.nan, False
         self._stale, self._fresh, self._plain, self._taken = curvature is None, False, False, 0
         self._soft = np.zeros(at.run.soft[0].size)  # multipliers
         self._damping = 0.0

@@ -8,11 +8,10 @@ from dataclasses import replace
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.delay import TINY
 
 NONE = 0.05
 """Delay over the period below which the delay is set to zero."""
-TINY = 1e-9
-"""Fraction of a period below which the fractional part of a delay is set to zero."""
 
 
 def delayed(trajectory: Trajectory, delay: float) -> Trajectory:
