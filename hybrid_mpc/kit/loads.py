@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
+from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
+from hybrid_mpc.estimate.tuning import rest_and_motion
 from hybrid_mpc.model.riccati import dare, lyapunov
 
 Array = NDArray[np.float64]
 QUIET_SHARE, MOST_SHARE = 0.0003, 0.04
 """Least standard deviation of the load's random walk per period in the quiet filter, as a share of the load's size
 (drift, temperature), and the largest one: the jump filter allows 0.05."""
-ADDED = 0.5
+ADDED = 0.25
 """Share by which faster estimates of all loads together may raise the variance of the input's changes that noise
 causes (docs/results/unknown_machines.md compares values)."""
 HALVINGS = 6
@@ -32,7 +33,7 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], control: OC
 
     A faster estimate finds a load sooner, but passes more noise on to the inputs. Each share is the largest one from
     :data:`QUIET_SHARE` to :data:`MOST_SHARE` that raises the variance of the input's changes by no more than its part
-    of :data:`ADDED`, with the other shares at :data:`QUIET_SHARE`.
+    of :data:`ADDED`, at rest and in motion, with the other shares at :data:`QUIET_SHARE`.
 
     Args:
         filter_of: The filter with such shares ``(n_d,)``.
@@ -43,7 +44,8 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], control: OC
     most = (1.0 + ADDED / max(n_d, 1)) * noise_of_inputs(filter_of(least), control)
 
     def bearable(j: int, share: float) -> bool:
-        return noise_of_inputs(filter_of(np.where(np.arange(n_d) == j, share, least)), control) <= most
+        found = noise_of_inputs(filter_of(np.where(np.arange(n_d) == j, share, least)), control)
+        return bool(np.any(found <= most) and not np.any(found > most))
 
     shares = least.copy()
     for j in range(n_d):
@@ -55,14 +57,14 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], control: OC
     return shares
 
 
-def noise_of_inputs(ekf: ExtendedKalmanFilter, control: OCP) -> float:
+def noise_of_inputs(ekf: ExtendedKalmanFilter, control: OCP) -> Array:
     """Variance per period of the input's changes, over half the input's range, that noise of sensors and states causes
-    in a loop without loads; the sum of all inputs.
+    in a loop without loads: the sum of all inputs, at rest and in motion ``(2,)``.
 
-    The loop is linear: the model at its operating point, the settled filter, and the regulator of the problem's weights
-    on states, outputs, inputs and their changes over an infinite horizon, which compensates the estimated load. So the
-    horizon of ``control`` does not matter. NaN if the filter's covariance does not settle, or no regulator stabilises
-    the linearized model.
+    The loop is linear: the model at either point of :func:`~hybrid_mpc.estimate.tuning.rest_and_motion`, the settled
+    filter, and the regulator of the problem's weights on states, outputs, inputs and their changes over an infinite
+    horizon, which compensates the estimated load. So the horizon of ``control`` does not matter. NaN if the filter's
+    covariance does not settle, or no regulator stabilises the linearized model.
 
     Args:
         ekf: The filter, with the loads of its model.
@@ -80,14 +82,19 @@ def noise_of_inputs(ekf: ExtendedKalmanFilter, control: OCP) -> float:
         >>> slow, quick = (ExtendedKalmanFilter(model, sigma_y=[0.1], sigma_x=[0.01], sigma_x0=[0.1], sigma_d=[step])
         ...                for step in (0.001, 0.1))
         >>> noise_of_inputs(slow, problem) < noise_of_inputs(quick, problem)
-        True
+        array([ True,  True])
     """
-    model, rest = ekf.model, ekf.start(np.full(ekf.model.n_y, np.nan))
-    f, c = ekf.tangent(rest, model.u0)
+    return np.array([_noise_at(ekf, control, at) for at in rest_and_motion(ekf)])
+
+
+def _noise_at(ekf: ExtendedKalmanFilter, control: OCP, at: Estimate) -> float:
+    """:func:`noise_of_inputs` at one point."""
+    model = ekf.model
+    f, c = ekf.tangent(at, model.u0)
     noise, noise_y = ekf.noise
     n_x, n_z, n_u, n_y = model.n_x, model.n_x + model.n_h, model.n_u, model.n_y
     assert model.with_jacobian is not None
-    b = model.with_jacobian(rest.x, rest.h, model.u0, model.w, model.p)[3].full()
+    b = model.with_jacobian(at.x, at.h, model.u0, model.w, model.p)[3].full()
     c_z, c_d, b_d = c[:, :n_z], c[:, n_z:], np.vstack([f[:n_z, n_z:], np.zeros((n_u, model.n_d))])
     # regulator over s = (x, h, last input), input: its change
     a_s = np.block([[f[:n_z, :n_z], b], [np.zeros((n_u, n_z)), np.eye(n_u)]])
