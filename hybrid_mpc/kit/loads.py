@@ -104,9 +104,8 @@ def _noise_at(ekf: ExtendedKalmanFilter, control: OCP, at: Estimate) -> float:
     weight[:n_z, :n_z] += c_z.T @ q_y @ c_z
     sizes = Sizes(model, control)
     size = np.concatenate([sizes.states, sizes.hidden, control.input_scale])
-    small = SMALL * max(
-        float(np.max(np.diag(weight) * size**2)), float(np.max(control.r_delta * size[n_z:] ** 2))
-    )
+    largest = float(np.max(np.concatenate([np.diag(weight) * size**2, control.r_delta * size[n_z:] ** 2])))
+    small = SMALL * largest or 1.0  # an economic problem may have no weights
     r = np.diag(control.r_delta + small / size[n_z:] ** 2)
     try:
         p, k = dare(a_s, b_s, weight + np.diag(small / size**2), r)
