@@ -35,11 +35,11 @@ if TYPE_CHECKING:  # what takes long to import is imported where it is made
 Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump")
 """Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
-SLIP_LOAD, JUMP_SHARE = 4.0, 0.05
+SLIP_LOAD, JUMP_SHARE = 8.0, 0.05
 """Random walk of the load per period in the slip filter over that in the quiet one, and in the jump filter as a share
-of the load's size. With as little as in the quiet filter, the slip filter explains a lasting load by repeated slips;
-with 16 times as much the golf robot's prior hunts around static friction (docs/results/unknown_machines.md). A jump of
-5 % of the drive's range is ordinary, a larger one takes a few periods."""
+of the load's size. With less the slip filter explains a lasting load by repeated slips, with more it takes an overflow
+for a load (docs/results/unknown_machines.md). A jump of 5 % of the drive's range is ordinary, a larger one takes a few
+periods."""
 SEARCHED = 100
 """Horizons after which a load that no filter has estimated counts as never estimated: its offset would last for minutes
 with a plan of seconds."""

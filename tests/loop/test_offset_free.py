@@ -92,7 +92,7 @@ def test_a_lasting_load_leaves_no_offset_whatever_the_horizon(horizon):
     assumed = SimpleNamespace(name="oven", sensor_sigma=(0.15,), first_sigma=None, control=problem)
     result = simulate(
         ModelPlant(model, (0.15,)), make_estimator(model, assumed, np.array([1.2, 0.17])),
-        make_controller(model, model, problem), lambda t: np.full((len(t), 1), 100.0), dt=10.0, duration=3000.0,
+        make_controller(model, model, problem), lambda t: np.full((len(t), 1), 100.0), dt=10.0, duration=4000.0,
         x0=model.x0, seed=0, faults=[Fault(600.0 + 10.0 * k, np.inf, "input_offset", -0.5) for k in range(30)],
     )  # fmt: skip
     assert np.max(np.abs(result.x[60:120, 1] - 100.0)) > 1.0  # the load is felt
