@@ -181,22 +181,16 @@ def _left(errors: Sequence[Array], periods: int, n_d: int) -> Array:
 
 
 def _errors(ekf: ExtendedKalmanFilter) -> list[Array]:
-    """Matrices ``(n, n)`` that propagate errors of a settled filter over one period, at :func:`rest_and_motion`; empty
-    if its covariance does not settle.
-    """
-    return [found for at in rest_and_motion(ekf) if (found := _error(ekf, at)) is not None]
-
-
-def rest_and_motion(ekf: ExtendedKalmanFilter) -> tuple[Estimate, Estimate]:
-    """The model's operating point, and a point beside it: dry friction at rest hides a load that motion reveals.
-
-    Beside it every state is moved by a tenth of its range, without a range by its first standard deviation.
+    """Matrices ``(n, n)`` that propagate errors of a settled filter over one period, at the operating point and beside
+    it; empty if its covariance does not settle.
     """
     model = ekf.model
     rest = ekf.start(np.full(model.n_y, np.nan))
     ranges = np.array([s.upper - s.lower for s in model.states])
+    # a tenth of its range from the operating point: a load may be seen in motion only
     x = rest.x + np.where(np.isfinite(ranges), 0.1 * ranges, np.sqrt(ekf.first[: model.n_x]))
-    return rest, replace(rest, x=x, h=hidden_fixed_point(model, x, model.u0, limit=START_LIMIT))
+    moving = replace(rest, x=x, h=hidden_fixed_point(model, x, model.u0, limit=START_LIMIT))
+    return [found for at in (rest, moving) if (found := _error(ekf, at)) is not None]
 
 
 def _error(ekf: ExtendedKalmanFilter, at: Estimate) -> Array | None:

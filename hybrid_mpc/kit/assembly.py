@@ -21,7 +21,6 @@ from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import FOUND, choose_most_likely, remaining_load
-from hybrid_mpc.kit.loads import QUIET_SHARE, quiet_shares
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 from hybrid_mpc.records import known
@@ -35,11 +34,15 @@ if TYPE_CHECKING:  # what takes long to import is imported where it is made
 Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump")
 """Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
-SLIP_LOAD, JUMP_SHARE = 8.0, 0.05
-"""Random walk of the load per period in the slip filter over that in the quiet one, and in the jump filter as a share
-of the load's size. With less the slip filter explains a lasting load by repeated slips, with more it takes an overflow
-for a load (docs/results/unknown_machines.md). A jump of 5 % of the drive's range is ordinary, a larger one takes a few
-periods."""
+QUIET_SHARE = 0.0003
+"""Standard deviation of the load's random walk per period in the quiet filter, as a share of the load's size (drift,
+temperature). It is doubled if the filter is too slow, see :func:`quiet_shares`."""
+FOUND_HORIZONS, MOST_DOUBLED = 1.5, 7
+"""Horizons of the controller within which quiet and slip filter must estimate two thirds of a constant load, and the
+largest number of doublings. Only loads that the jump filter does not detect take that long. The golf robot's quiet
+filter takes 1.3 horizons, the disk's less, so neither is doubled: with faster filters a loop limit-cycles around static
+friction, and intermittent model errors are taken for loads. With four horizons instead, the cost under a load is 1.3 to
+1.5 times as large for machines that only lag, as heaters and arms (docs/results/simulated_machines.md)."""
 SEARCHED = 100
 """Horizons after which a load that no filter has estimated counts as never estimated: its offset would last for minutes
 with a plan of seconds."""
@@ -217,9 +220,13 @@ def make_estimator(
 
     if not observer:
         return filter_of(1.0, None)
-    quiet = quiet_shares(partial(filter_of, 1.0), control, model.n_d)
-    slip = np.minimum(SLIP_LOAD * quiet, JUMP_SHARE)
-    modes = filter_of(1.0, quiet), filter_of(SLIP, slip), filter_of(1.0, np.full(model.n_d, JUMP_SHARE))
+    periods = round(FOUND_HORIZONS * control.horizon)
+    quiet, slip = (quiet_shares(partial(filter_of, scale), periods, model.n_d) for scale in (1.0, SLIP))
+    # else the slip filter would explain a lasting load by repeated slips, and never estimate it
+    # jump: a load of 5 % of the drive's range is ordinary, a larger one takes a few periods
+    modes = (
+        filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, 0.05)),
+    )  # fmt: skip
     _check_found(modes, SEARCHED * control.horizon, Sizes(model, control).states)
     return SwitchingFilter(modes, SWITCHES)
 
@@ -247,6 +254,21 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Arr
         "period) explains every load. A constant load would cause an offset. Correct the prior, set "
         "Scenario(state_noise={...}), or run the scenario again [HM-KIT-013]"
     )
+
+
+def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: int, n_d: int) -> Array:
+    """Random walk ``(n_d,)`` of the loads per period in the quiet or slip filter, as shares of their sizes.
+
+    Each is :data:`QUIET_SHARE`, doubled at most :data:`MOST_DOUBLED` times, until the filter estimates two thirds of a
+    constant load within ``periods``, at rest or in motion.
+    """
+    shares = np.full(n_d, QUIET_SHARE)
+    for _ in range(MOST_DOUBLED):
+        slow = remaining_load(filter_of(shares), periods) > FOUND
+        if not slow.any():
+            break
+        shares = np.where(slow, 2.0 * shares, shares)
+    return shares
 
 
 def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:

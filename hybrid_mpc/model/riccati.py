@@ -61,7 +61,7 @@ def dare(a: ArrayLike, b: ArrayLike, q: ArrayLike, r: ArrayLike) -> tuple[Array,
                 closed = a - b @ k
                 if not np.max(np.abs(np.linalg.eigvals(closed))) < 1.0:
                     break
-                p = lyapunov(closed, q + k.T @ r @ k)
+                p = _lyapunov(closed, q + k.T @ r @ k)
             k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
             radius = float(np.max(np.abs(np.linalg.eigvals(a - b @ k))))
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -94,7 +94,7 @@ def _doubled(a: Array, b: Array, q: Array, r: Array) -> Array:
     return h
 
 
-def lyapunov(a: Array, q: Array) -> Array:
+def _lyapunov(a: Array, q: Array) -> Array:
     """``P = A'PA + Q``: the sum of ``A'^k Q A^k``, with twice as many terms after each step."""
     p = q
     for _ in range(DOUBLINGS):

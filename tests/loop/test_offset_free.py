@@ -1,9 +1,7 @@
 """Constant loads rejected, with and without delays and dry friction."""
 
 from functools import cache
-from types import SimpleNamespace
 
-import casadi as ca
 import numpy as np
 import pytest
 from closed_loop_parts import POINT, hold, make_ekf, run
@@ -14,15 +12,12 @@ from hybrid_mpc import (
     CondensedController,
     DelayCompensation,
     Fault,
-    HybridModel,
     SafeController,
-    Signal,
     load,
     make_controller,
     make_estimator,
     simulate,
 )
-from hybrid_mpc.loop.plant import ModelPlant
 from scenarios.golf_robot import scenario
 
 SAME = {"gravity": 2.4, "damping": 0.2, "friction": 0.0, "inertia": 0.14}
@@ -71,32 +66,6 @@ def test_delays_that_are_known_leave_no_offset_either(sensor, inputs):
     result = loop(sensor, inputs, plant=plant, reference=hold, duration=6.0, x0=[0.4, 0.0], faults=[fault])
     assert np.max(np.abs(result.x[-50:, 0] - 0.4)) < 1e-6
     assert set(result.source) == {"MPC"}
-
-
-def oven():
-    """A heater and the chamber that it warms: 11 and 155 periods of time constants."""
-    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
-    heater, chamber = Signal("heater", "K", 0.0, 500.0), Signal("chamber", "K", 0.0, 300.0)
-    nxt = ca.vertcat(x[0] + 0.25 * u - 0.09 * (x[0] - x[1]), x[1] + 0.01 * (x[0] - x[1]) - 0.0065 * x[1])
-    return HybridModel.of(
-        "oven", 10.0, (heater, chamber), (Signal("power", "%"),), (chamber,), x=x, u=u, x_next=nxt,
-        xdot=(nxt - x) / 10.0, y=x[1], nominal_x=(165.0, 100.0), nominal_u=(23.4,),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("horizon", [20, 100])
-def test_a_lasting_load_leaves_no_offset_whatever_the_horizon(horizon):
-    """A door opens slowly; of horizons of 100 periods the observer once found two thirds within 150."""
-    model = oven()
-    problem = OCP(horizon, [0.0, 0.0], [0.0], [0.01], [0.0], [100.0], q_y=[0.25])
-    assumed = SimpleNamespace(name="oven", sensor_sigma=(0.15,), first_sigma=None, control=problem)
-    result = simulate(
-        ModelPlant(model, (0.15,)), make_estimator(model, assumed, np.array([1.2, 0.17])),
-        make_controller(model, model, problem), lambda t: np.full((len(t), 1), 100.0), dt=10.0, duration=4000.0,
-        x0=model.x0, seed=0, faults=[Fault(600.0 + 10.0 * k, np.inf, "input_offset", -0.5) for k in range(30)],
-    )  # fmt: skip
-    assert np.max(np.abs(result.x[60:120, 1] - 100.0)) > 1.0  # the load is felt
-    assert abs(np.mean(result.x[-100:, 1]) - 100.0) < 0.15
 
 
 def swings(error, size):
