@@ -34,7 +34,7 @@ from parts import arguments, report
 
 import hybrid_mpc as hm
 from hybrid_mpc.control import qp as controls
-from hybrid_mpc.control.active_set import ActiveSet, RowQP
+from hybrid_mpc.model.active_set import ActiveSet, RowQP
 from hybrid_mpc.loop.simulate import Step
 
 STORE = Path(__file__).with_suffix(".npz")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dgemv
 
-from hybrid_mpc.control.active_set import Active
+from hybrid_mpc.model.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.control.active_set import PRIMAL_TOLERANCE, Active
+from hybrid_mpc.model.active_set import PRIMAL_TOLERANCE, Active
 from hybrid_mpc.control.curvature import StageCurvature, convex
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Controller, Solution, Status, Target

@@ -1,0 +1,384 @@
+"""Moving horizon estimator: the likeliest trajectory over a window, with bounds and a robust loss.
+
+Over a window of ``m`` periods the estimate is the trajectory ``z_0 .. z_m`` of ``z = (x, h, d)`` that minimizes::
+
+    1/2 |z_0 - first|^2_{P_0^-1}  +  1/2 sum |z_{k+1} - f(z_k, u_k)|^2_{Q^-1}  +  sum rho((y_k - g(z_k, u_k)) / sigma)
+
+subject to ``lower <= x_k <= upper``; ``rho`` is Huber's loss, ``e^2 / 2`` up to ``huber`` and linear beyond. Where a
+component has neither initial variance nor noise it is an equality constraint.
+
+**Linearized problem.** One Gauss-Newton step linearizes ``f`` and ``g`` along the last trajectory. With standardized
+unknowns ``xi`` (``z_0 = first + L xi_0``, noises ``sqrt(Q) xi_k``) the rows of outputs and bounds are ``X xi``, and the
+dual problem has one unknown per row::
+
+    min 1/2 l' (X X' + I) l - e' l,    |l_i| <= huber for outputs,    l_i >= 0 for bounds (no I there)
+
+Huber's loss is a box on the multipliers, since the conjugate of a quadratic loss with linear tails is the quadratic on
+an interval; a bound is a row without noise. So outliers and bounds are *one* quadratic program with bounds, which the
+active-set method of the controller solves exactly: no reweighting iterations.
+
+**Why the dual.** 20 periods with z = 32 are 672 unknowns, or 20 to 80 rows. A Riccati recursion costs 40 products of
+32 x 32 matrices for each change of an outlier or bound; here the rows are propagated once backwards through the window
+(:func:`_back`, 20 small products), and each change costs a factorization of the size of the rows. Neither ``P_0`` nor
+``Q`` is inverted, so hidden states without noise and constant disturbances need no special case.
+
+Sources: Rao, Rawlings, Mayne, *Constrained state estimation for nonlinear discrete-time systems*, IEEE Trans. Automatic
+Control 48 (2003): problem and arrival cost; Kühl, Diehl, Kraus, Schlöder, Bock, *A real-time algorithm for moving
+horizon state and parameter estimation*, Computers and Chemical Engineering 35 (2011): one step per period; Courtier,
+*Dual formulation of four-dimensional variational assimilation*, Q. J. R. Meteorol. Soc. 123 (1997): unknowns in the
+space of the measurements; Huber, *Robust estimation of a location parameter*, Ann. Math. Statist. 35 (1964).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, absorbed
+from hybrid_mpc.estimate.roots import root
+from hybrid_mpc.model.active_set import ActiveSet, RowQP
+from hybrid_mpc.model.buffered import BufferedFunction
+from hybrid_mpc.model.limits import MOST_ITERATIONS, numbers, sampled, whole
+from hybrid_mpc.model.model import HybridModel, output_with_jacobian
+from hybrid_mpc.model.stages import stages
+
+Array = NDArray[np.float64]
+HUBER = 2.0
+"""Residual, in the sensor's standard deviations, from which the loss is linear."""
+MOST_PERIODS = 1000
+"""Most periods of a window; its cost grows with their square."""
+FARTHEST = 1e100
+"""Largest residual, in standard deviations; a larger one has the same effect, and its square is finite."""
+NOISE_OF_BOUND = 1e-13
+"""Variance of a bound's row, over the variance without measurements: keeps dependent rows solvable."""
+STRONGEST = 1e6
+"""Largest multiplier of a bound, in its row's standard deviations: contradictory bounds are violated."""
+VIOLATED = 1e-9
+"""Violation of a bound, in its row's standard deviations, from which its row is added."""
+MOST_ADDED = 10
+"""Most times that rows of bounds are added in a step."""
+CONVERGED = 1e-9
+"""Largest step, in standard deviations of the estimate, of a trajectory that has converged."""
+
+
+@dataclass(frozen=True)
+class WindowEstimate(Estimate):
+    """An estimate with its window of ``m`` periods, the oldest first.
+
+    Args:
+        z: Trajectory ``(m + 1, n)`` of ``(x, h, d)``; the last is the estimate.
+        ys: Measurements ``(m, n_y)`` of all but the first time; NaN where nothing was measured.
+        us: Inputs ``(m, n_u)`` held over the periods.
+        ws: Measured disturbances ``(m, n_w)`` from the beginning of each period on.
+        first: Mean ``(n,)`` of the arrival cost at the first time, whose measurement it contains.
+        first_p: Its covariance ``(n, n)``.
+    """
+
+    z: Array
+    ys: Array
+    us: Array
+    ws: Array
+    first: Array
+    first_p: Array
+
+
+class MovingHorizonEstimator(ExtendedKalmanFilter):
+    """Moving horizon estimator over ``(x, h, d)``, for outliers and bounds; start, noise and restarts are those of
+    :class:`ExtendedKalmanFilter`.
+
+    Each sample takes ``iterations`` Gauss-Newton steps on the window. The arrival cost is that of an extended Kalman
+    filter linearized along the window's trajectory; a sample that leaves the window as an outlier keeps its bounded
+    influence. Bounds do not enter the arrival cost: it stays a lower bound of the true one (Rao et al., section 4).
+    For a linear model without bounds and with ``huber=inf`` the estimate is the Kalman filter's, for any window.
+
+    The covariance ``P`` is that of the extended Kalman filter along these estimates; a last sample that is an outlier
+    does not reduce it. Likelihood, innovation and NIS are those of the prediction.
+
+    Args:
+        model: The deployed model. Tracked parameters are states of it
+            (:class:`~hybrid_mpc.estimate.tracking.TrackingFilter`).
+        sigma_y: As for :class:`ExtendedKalmanFilter`, like the following.
+        sigma_x: See there.
+        sigma_x0: See there.
+        sigma_d: See there.
+        sigma_d0: See there.
+        sigma_h: See there.
+        sigma_h0: See there.
+        periods: Longest window [periods]. Default: 20.
+        lower: Lower bounds ``(n_x,)`` of the states; ``-inf`` for none. Default: the signals' ranges, except those of
+            periodic signals.
+        upper: Upper bounds, likewise.
+        huber: Residual in standard deviations from which the loss is linear; ``inf``: no robust loss. Default: 2, with
+            which clean samples lose 1 % of their information, and an outlier moves an estimate no further than an
+            ordinary error of 2 standard deviations.
+        iterations: Most Gauss-Newton steps per sample. Default: 1, the real-time iteration.
+
+    Raises:
+        InputError: As :class:`ExtendedKalmanFilter`; if a lower bound is not below its upper bound, ``huber`` is not
+            positive, or ``periods`` or ``iterations`` is out of range.
+
+    Example:
+        >>> import casadi as ca
+        >>> from hybrid_mpc.machine.signals import Signal
+        >>> x, u, level = ca.MX.sym("x"), ca.MX.sym("u"), (Signal("x", "m", 0.0),)
+        >>> tank = HybridModel.of("tank", 1.0, level, (Signal("u", "m/s"),), level, x=x, u=u, x_next=x + u, xdot=u, y=x)
+        >>> mhe = MovingHorizonEstimator(tank, sigma_y=[0.1], sigma_x=[0.1], sigma_x0=[0.1])
+        >>> estimate = mhe.update(mhe.start(np.array([0.2])), y=np.array([-0.3]), u_prev=np.array([-0.2]))
+        >>> float(estimate.x[0])
+        0.0
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        *,
+        sigma_y: ArrayLike,
+        sigma_x: ArrayLike,
+        sigma_x0: ArrayLike,
+        sigma_d: ArrayLike | None = None,
+        sigma_d0: ArrayLike | None = None,
+        sigma_h: ArrayLike | None = None,
+        sigma_h0: ArrayLike | None = None,
+        periods: int = 20,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        huber: float = HUBER,
+        iterations: int = 1,
+    ) -> None:
+        super().__init__(
+            model, sigma_y=sigma_y, sigma_x=sigma_x, sigma_x0=sigma_x0, sigma_d=sigma_d, sigma_d0=sigma_d0,
+            sigma_h=sigma_h, sigma_h0=sigma_h0,
+        )  # fmt: skip
+        self.periods = whole(periods, "periods", 1, MOST_PERIODS)
+        self.iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
+        self.huber = float(numbers([huber], "huber")[0])
+        if not self.huber > 0:
+            raise InputError(f"huber: must be positive, got {huber} [HM-ESTIMATE-028]")
+        self.lower, self.upper = _bounds(model, lower, upper)
+        self._sigma_y = np.sqrt(self._noise_y)
+        self._noisy = np.flatnonzero(self._noise)
+        self._sigma = np.sqrt(self._noise[self._noisy])
+        self._stages = stages(model, self.periods)
+        self._outputs = BufferedFunction(output_with_jacobian(model).map(self.periods))
+
+    def same_on(self, model: HybridModel, **sigmas: Array) -> MovingHorizonEstimator:
+        """See :meth:`ExtendedKalmanFilter.same_on`; window, bounds and loss are the same."""
+        return MovingHorizonEstimator(
+            model, periods=self.periods, lower=self.lower, upper=self.upper, huber=self.huber,
+            iterations=self.iterations, **sigmas,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> WindowEstimate:
+        """See :meth:`ExtendedKalmanFilter.start`; the state is moved into its bounds."""
+        return self._alone(super().start(y, t, w=w))
+
+    def _alone(self, estimate: Estimate) -> WindowEstimate:
+        """The estimate with an empty window, whose arrival cost it is."""
+        first = np.concatenate([estimate.x, estimate.h, estimate.d])
+        x = np.clip(estimate.x, self.lower, self.upper)
+        z = np.concatenate([x, estimate.h, estimate.d])[None]
+        none = (np.zeros((0, size)) for size in (self.model.n_y, self.model.n_u, self.model.n_w))
+        return WindowEstimate(
+            estimate.t, x, estimate.h, estimate.d, estimate.P, estimate.innovation, estimate.nis, z, *none, first,
+            estimate.P, w=estimate.w,
+        )  # fmt: skip
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
+    def predict(self, estimate: Estimate, u: ArrayLike) -> WindowEstimate:
+        """Estimate one period later with the input ``u`` ``(n_u,)`` held; the window contains it without a sample."""
+        own = estimate if isinstance(estimate, WindowEstimate) else self._alone(estimate)
+        ahead = super().predict(own, u)
+        x = np.clip(ahead.x, self.lower, self.upper)
+        first, first_p, gone = own.first, own.first_p, int(len(own.ys) >= self.periods)
+        if gone:
+            first, first_p = self._later(own)
+        return WindowEstimate(
+            ahead.t, x, ahead.h, ahead.d, ahead.P, ahead.innovation, ahead.nis,
+            np.vstack([own.z[gone:], np.concatenate([x, ahead.h, ahead.d])]), np.vstack([own.ys[gone:], ahead.innovation]),
+            np.vstack([own.us[gone:], sampled(u, (self.model.n_u,), "u")]), np.vstack([own.ws[gone:], ahead.w]),
+            first, first_p, w=ahead.w,
+        )  # fmt: skip
+
+    def _later(self, own: WindowEstimate) -> tuple[Array, Array]:
+        """Arrival cost at the window's second time: one period of an extended Kalman filter along the trajectory."""
+        w = own.ws[1] if len(own.ws) > 1 else own.w
+        before, after = (self._at(own, z, w) for z, w in ((own.z[0], own.ws[0]), (own.z[1], w)))
+        u, y = own.us[0], own.ys[0]
+        f = self._transition(before, u)
+        x, h, *_ = self._step.outputs  # of the next call
+        moved = np.concatenate([x + self._on_x @ before.d, h, before.d])
+        first = moved + f @ (own.first - own.z[0])
+        p = f @ own.first_p @ f.T
+        p.flat[:: p.shape[0] + 1] += self._noise
+        y_hat, c = self._predicted(after, u)
+        residual = (y - y_hat) / self._sigma_y
+        usual = np.abs(residual) <= self.huber  # False for NaN
+        step, p, *_ = absorbed(p, c, y - y_hat - c @ (first - own.z[1]), self._noise_y, usual)
+        # gradient of the loss's linear part; a missing sample has none
+        force = np.where(usual | ~np.isfinite(y), 0.0, self.huber * np.sign(residual) / self._sigma_y)
+        return first + step + p @ (c.T @ force), p
+
+    def _at(self, own: WindowEstimate, z: Array, w: Array) -> Estimate:
+        x, h, d = np.split(z, np.cumsum(self._sizes[:2]))
+        return replace(own, x=x, h=h, d=d, w=w)
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite falls back to the filter
+    def assess(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> tuple[WindowEstimate, float]:
+        """Estimate after the measurement ``y`` ``(n_y,)``, and the log-likelihood of the measurement, without its
+        constant. If the window's solution is not finite, the window restarts at the Kalman filter's estimate.
+        """
+        own = estimate if isinstance(estimate, WindowEstimate) else self._alone(estimate)
+        y = sampled(y, (self.model.n_y,), "y")
+        if not np.isfinite(y).any():
+            return own, 0.0
+        filtered, likelihood = super().assess(own, y, u)
+        if not len(own.ys):
+            return self._alone(filtered), likelihood
+        ys = own.ys.copy()
+        ys[-1] = y
+        z, outlier = self._solved(own, ys)
+        if not np.isfinite(z).all():
+            return self._alone(filtered), likelihood
+        x, h, d = np.split(z[-1], np.cumsum(self._sizes[:2]))
+        p = super().assess(own, np.where(outlier, np.nan, y), u)[0].P if outlier.any() else filtered.P
+        return replace(
+            own, x=x, h=h, d=d, P=p, innovation=filtered.innovation, nis=filtered.nis, z=z, ys=ys
+        ), likelihood
+
+    def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> WindowEstimate:
+        """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`."""
+        return self.assess(estimate, y, u)[0]
+
+    def _solved(self, own: WindowEstimate, ys: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Trajectory ``(m + 1, n)`` of the window, and the outliers ``(n_y,)`` among its last outputs."""
+        z, first_root = own.z, root(own.first_p)
+        outlier = np.zeros(self.model.n_y, dtype=bool)
+        if not np.isfinite(first_root).all():
+            return np.full_like(z, np.nan), outlier
+        size = np.sqrt(np.maximum(np.diag(own.P), 0.0))
+        for _ in range(self.iterations):
+            last = z
+            z, outlier = self._improved(own, ys, last, first_root)
+            if not np.isfinite(z).all() or np.all(np.abs(z - last) <= CONVERGED * size):
+                break
+        return z, outlier
+
+    def _improved(
+        self, own: WindowEstimate, ys: Array, z: Array, first_root: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """The linearized problem's solution, and the outliers among its last outputs."""
+        f, defects, y_hat, c = self._linearized(own, z)
+        n_x, start, seen = self._sizes[0], own.first - z[0], np.isfinite(ys)
+        time, output = np.nonzero(seen)  # sorted by time
+        free = _forward(f, defects, start)
+        error = (ys - y_hat - (c @ free[1:, :, None])[..., 0]) / self._sigma_y
+        e = np.clip(error[seen], -FARTHEST, FARTHEST)
+        x = self._back(f, c[seen] / self._sigma_y[output][:, None], time + 1, first_root)
+        high, noise = np.full(e.size, self.huber), np.ones(e.size)
+        low, held = -high, np.zeros((len(z), n_x), dtype=bool)
+        for _ in range(MOST_ADDED):
+            multipliers = _box_qp(x @ x.T + np.diag(noise), e, low, high)
+            moved = z + self._moved(f, defects, start, multipliers @ x, first_root)
+            below, above = moved[:, :n_x] < self.lower, moved[:, :n_x] > self.upper
+            k, i = np.nonzero((below | above) & ~held)
+            if not k.size:
+                break
+            rows = self._back(f, np.eye(z.shape[1])[i], k, first_root)
+            deviation = np.sqrt(np.sum(rows**2, axis=1))
+            limit = np.where(above[k, i], self.upper[i], self.lower[i])
+            new = np.abs(moved[k, i] - limit) > VIOLATED * deviation
+            new &= deviation > 0  # a known state cannot be moved
+            if not new.any():
+                break
+            k, i, deviation, limit = k[new], i[new], deviation[new], limit[new]
+            held[k, i] = True
+            x = np.vstack([x, rows[new] / deviation[:, None]])
+            e = np.append(e, (limit - z[k, i] - free[k, i]) / deviation)
+            noise = np.append(noise, np.full(k.size, NOISE_OF_BOUND))
+            low = np.append(low, np.where(above[k, i], -STRONGEST, 0.0))
+            high = np.append(high, np.where(above[k, i], 0.0, STRONGEST))
+        moved[:, :n_x] = np.clip(moved[:, :n_x], self.lower, self.upper)  # the QP keeps them within rounding
+        last = time == len(ys) - 1
+        outlier = np.zeros(ys.shape[1], dtype=bool)
+        outlier[output[last]] = np.abs(multipliers[: time.size][last]) >= self.huber * (1 - 1e-9)
+        return moved, outlier
+
+    def _linearized(self, own: WindowEstimate, z: Array) -> tuple[Array, Array, Array, Array]:
+        """Along a trajectory: slopes ``(m, n, n)`` and defects ``(m, n)`` of the periods, outputs ``(m, n_y)`` of all
+        but the first time, and their slopes ``(m, n_y, n)``.
+        """
+        (n_x, n_h, n_d, n_y), m, n_u = self._sizes, len(own.us), self.model.n_u
+        n_z, model = n_x + n_h, self.model
+        every = np.minimum(np.arange(self.periods), m - 1)  # the functions have the longest window's size
+        d = z[:-1, n_z:]
+        v = [own.us + d @ self._on_u.T, own.ws]
+        v += [d @ self._on_x.T] * (model.n_v > n_u + model.n_w)
+        z_next, a_t, b = self._stages.at(z[every, :n_z], np.hstack(v)[every])
+        f = np.zeros((m, n_z + n_d, n_z + n_d))
+        f[:, :n_z, :n_z], f[:, :n_z, n_z:] = a_t[:m].transpose(0, 2, 1), b[:m] @ self._on_u
+        f[:, :n_x, n_z:] += self._on_x
+        f[:, n_z:, n_z:] = np.eye(n_d)
+        defects = np.hstack([z_next[:m], d]) - z[1:]
+        x, u, w = (given.reshape(self.periods, -1) for given in self._outputs.inputs)
+        d, ws = z[1:, n_z:], np.vstack([own.ws[1:], own.w])
+        x[:], u[:], w[:] = z[1 + every, :n_x], (own.us + d @ self._on_u.T)[every], ws[every]
+        self._outputs()
+        y, by_x, by_u = self._outputs.outputs
+        c = np.zeros((m, n_y, n_z + n_d))
+        c[:, :, :n_x] = by_x.reshape(-1, n_x, n_y)[:m].transpose(0, 2, 1)
+        c[:, :, n_z:] = by_u.reshape(-1, n_u, n_y)[:m].transpose(0, 2, 1) @ self._on_u + self._on_y
+        return f, defects, y.reshape(-1, n_y)[:m] + d @ self._on_y.T, c
+
+    def _back(self, f: Array, rows: Array, time: NDArray[np.int64], first_root: Array) -> Array:
+        """Slopes ``(R, n + m n_noisy)`` by ``xi`` of rows ``(R, n)`` of ``z`` at times ``(R,)`` in ascending order."""
+        m, n, n_noisy = len(f), rows.shape[1], self._noisy.size
+        by_z = np.array(rows)
+        found = np.zeros((len(rows), n + m * n_noisy))
+        from_time = np.searchsorted(time, np.arange(m + 1)).tolist()
+        for k in range(m, 0, -1):
+            later = by_z[from_time[k] :]
+            found[from_time[k] :, n + (k - 1) * n_noisy : n + k * n_noisy] = later[:, self._noisy] * self._sigma
+            by_z[from_time[k] :] = later @ f[k - 1]
+        found[:, :n] = by_z @ first_root
+        return found
+
+    def _moved(self, f: Array, defects: Array, first: Array, xi: Array, first_root: Array) -> Array:
+        """Step ``(m + 1, n)`` of the trajectory for standardized unknowns."""
+        n, noise = len(first), defects.copy()
+        noise[:, self._noisy] += xi[n:].reshape(len(f), -1) * self._sigma
+        return _forward(f, noise, first + first_root @ xi[:n])
+
+
+def _forward(f: Array, added: Array, first: Array) -> Array:
+    """``dz_{k+1} = F_k dz_k + added_k`` from ``first``: ``(m + 1, n)``."""
+    dz = np.vstack([first, added])
+    for k in range(len(f)):
+        dz[k + 1] += f[k] @ dz[k]
+    return dz
+
+
+def _box_qp(h: Array, e: Array, lower: Array, upper: Array) -> Array:
+    """``argmin 1/2 l'hl - e'l`` within bounds; NaN without a finite solution."""
+    rows = np.zeros((0, e.size))
+    qp = RowQP(h, -e, rows, lower, upper, np.full(e.size, np.inf), np.zeros(e.size))
+    return ActiveSet(qp).solve().s
+
+
+def _bounds(model: HybridModel, lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[Array, Array]:
+    """Bounds ``(n_x,)`` of the states: the given ones, else the ranges of signals that are not periodic."""
+    found = []
+    for name, given, none in (("lower", lower, -np.inf), ("upper", upper, np.inf)):
+        own = [none if s.periodic else getattr(s, name) for s in model.states]
+        values = numbers(own if given is None else given, name)
+        if values.size != model.n_x:
+            raise InputError(f"{name}: must have {model.n_x} values, got {values.size} [HM-ESTIMATE-029]")
+        found.append(values)
+    if not np.all(found[0] < found[1]):
+        raise InputError(
+            f"lower, upper: each lower bound must be below its upper bound, got {found[0]} and {found[1]} "
+            "[HM-ESTIMATE-030]"
+        )
+    return found[0], found[1]
