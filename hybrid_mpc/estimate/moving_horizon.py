@@ -56,10 +56,20 @@ NOISE_OF_BOUND = 1e-13
 """Variance of a bound's row, over the variance without measurements: keeps dependent rows solvable."""
 STRONGEST = 1e6
 """Largest multiplier of a bound, in its row's standard deviations: contradictory bounds are violated."""
+FAR = 1e3
+"""Largest residual, over the one from which a sample is an outlier whatever the others show."""
 VIOLATED = 1e-9
 """Violation of a bound, in its row's standard deviations, from which its row is added."""
 MOST_ADDED = 10
 """Most times that rows of bounds are added in a step."""
+FEWEST = 3
+"""Fewest outliers that can be the majority of a window."""
+MAJORITY = 3.0
+"""Residuals up to so many times their median are released where most samples of an output are outliers."""
+ROUNDING = 1e-9
+"""Share of the largest multiplier within which it is reached."""
+IMPOSSIBLE = 1e5
+"""Standardized unknown of a window that its assumptions exclude: an absurd input, or a start at an absurd sample."""
 CONVERGED = 1e-9
 """Largest step, in standard deviations of the estimate, of a trajectory that has converged."""
 
@@ -176,14 +186,13 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         return self._alone(super().start(y, t, w=w))
 
     def _alone(self, estimate: Estimate) -> WindowEstimate:
-        """The estimate with an empty window, whose arrival cost it is."""
-        first = np.concatenate([estimate.x, estimate.h, estimate.d])
+        """The estimate, moved into the bounds, with an empty window, whose arrival cost it is."""
         x = np.clip(estimate.x, self.lower, self.upper)
-        z = np.concatenate([x, estimate.h, estimate.d])[None]
+        z = np.concatenate([x, estimate.h, estimate.d])
         none = (np.zeros((0, size)) for size in (self.model.n_y, self.model.n_u, self.model.n_w))
         return WindowEstimate(
-            estimate.t, x, estimate.h, estimate.d, estimate.P, estimate.innovation, estimate.nis, z, *none, first,
-            estimate.P, w=estimate.w,
+            estimate.t, x, estimate.h, estimate.d, estimate.P, estimate.innovation, estimate.nis, z[None], *none,
+            z, estimate.P, w=estimate.w,
         )  # fmt: skip
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
@@ -228,7 +237,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite falls back to the filter
     def assess(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> tuple[WindowEstimate, float]:
         """Estimate after the measurement ``y`` ``(n_y,)``, and the log-likelihood of the measurement, without its
-        constant. If the window's solution is not finite, the window restarts at the Kalman filter's estimate.
+        constant. If the window has no solution, or one that its noise makes impossible, the estimate starts anew.
         """
         own = estimate if isinstance(estimate, WindowEstimate) else self._alone(estimate)
         y = sampled(y, (self.model.n_y,), "y")
@@ -241,7 +250,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         ys[-1] = y
         z, outlier = self._solved(own, ys)
         if not np.isfinite(z).all():
-            return self._alone(filtered), likelihood
+            return self.start(y, own.t, w=own.w), likelihood
         x, h, d = np.split(z[-1], np.cumsum(self._sizes[:2]))
         p = super().assess(own, np.where(outlier, np.nan, y), u)[0].P if outlier.any() else filtered.P
         return replace(
@@ -277,11 +286,14 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         error = (ys - y_hat - (c @ free[1:, :, None])[..., 0]) / self._sigma_y
         e = np.clip(error[seen], -FARTHEST, FARTHEST)
         x = self._back(f, c[seen] / self._sigma_y[output][:, None], time + 1, first_root)
-        high, noise = np.full(e.size, self.huber), np.ones(e.size)
+        noise = np.ones(e.size)
+        multipliers, high, e = self._robust(x @ x.T + np.diag(noise), e, output)
         low, held = -high, np.zeros((len(z), n_x), dtype=bool)
         for _ in range(MOST_ADDED):
-            multipliers = _box_qp(x @ x.T + np.diag(noise), e, low, high)
-            moved = z + self._moved(f, defects, start, multipliers @ x, first_root)
+            xi = multipliers @ x
+            if not np.abs(xi).max(initial=0.0) < IMPOSSIBLE:
+                return np.full_like(z, np.nan), np.zeros(ys.shape[1], dtype=bool)
+            moved = z + self._moved(f, defects, start, xi, first_root)
             below, above = moved[:, :n_x] < self.lower, moved[:, :n_x] > self.upper
             k, i = np.nonzero((below | above) & ~held)
             if not k.size:
@@ -300,11 +312,39 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             noise = np.append(noise, np.full(k.size, NOISE_OF_BOUND))
             low = np.append(low, np.where(above[k, i], -STRONGEST, 0.0))
             high = np.append(high, np.where(above[k, i], 0.0, STRONGEST))
+            multipliers = _box_qp(x @ x.T + np.diag(noise), e, low, high)
         moved[:, :n_x] = np.clip(moved[:, :n_x], self.lower, self.upper)  # the QP keeps them within rounding
         last = time == len(ys) - 1
         outlier = np.zeros(ys.shape[1], dtype=bool)
-        outlier[output[last]] = np.abs(multipliers[: time.size][last]) >= self.huber * (1 - 1e-9)
+        outlier[output[last]] = np.abs(multipliers[: time.size][last]) >= self.huber * (1 - ROUNDING)
         return moved, outlier
+
+    def _robust(self, h: Array, e: Array, output: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+        """Multipliers of the measurements without bounds, their limits, and the residuals ``e`` without excess.
+
+        The limit is ``huber``, the derivative of the loss's linear part. Where most samples of an output are outliers,
+        the estimate is wrong and not the sensor (a first sample that was an outlier, an unknown jump): those near their
+        median are then weighed by squares.
+        """
+        most = np.full(e.size, self.huber)
+        if not np.isfinite(self.huber):
+            return _box_qp(h, e, -most, most), most, e
+        # l_i is at its limit in any case if |e_i| > huber sum_j |h_ij|; larger numbers only cost digits
+        far = FAR * self.huber * np.sum(np.abs(h), axis=1)
+        e = np.clip(e, -far, far)
+        found = _box_qp(h, e, -most, most)
+        outlier = np.abs(found) >= self.huber * (1 - ROUNDING)
+        released = np.zeros(e.size, dtype=bool)
+        for i in np.unique(output[outlier]):
+            own = output == i
+            count = int(np.count_nonzero(outlier[own]))
+            if count >= FEWEST and 2 * count > np.count_nonzero(own):
+                size = np.abs(e) / np.sqrt(h.diagonal())
+                released |= own & (size <= MAJORITY * np.median(size[own]))
+        if released.any():
+            most[released] = np.inf
+            found = _box_qp(h, e, -most, most)
+        return found, most, e
 
     def _linearized(self, own: WindowEstimate, z: Array) -> tuple[Array, Array, Array, Array]:
         """Along a trajectory: slopes ``(m, n, n)`` and defects ``(m, n)`` of the periods, outputs ``(m, n_y)`` of all
