@@ -8,9 +8,9 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.model.active_set import Active, ActiveSet, RowQP
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import BoundRows, Status
+from hybrid_mpc.model.active_set import Active, ActiveSet, RowQP
 
 Array = NDArray[np.float64]
 Soft = tuple[Array, Array] | None

@@ -322,7 +322,7 @@ class ExtendedKalmanFilter:
 
         ``sigmas`` are the arguments of the constructor.
         """
-        return type(self)(model, **sigmas)  # type: ignore[arg-type]
+        return type(self)(model, **sigmas)
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
         """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``."""

@@ -178,7 +178,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         """See :meth:`ExtendedKalmanFilter.same_on`; window, bounds and loss are the same."""
         return MovingHorizonEstimator(
             model, periods=self.periods, lower=self.lower, upper=self.upper, huber=self.huber,
-            iterations=self.iterations, **sigmas,  # type: ignore[arg-type]
+            iterations=self.iterations, **sigmas,
         )  # fmt: skip
 
     def start(self, y: ArrayLike, t: float = 0.0, *, w: ArrayLike | None = None) -> WindowEstimate:
@@ -189,9 +189,9 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         """The estimate, moved into the bounds, with an empty window, whose arrival cost it is."""
         x = np.clip(estimate.x, self.lower, self.upper)
         z = np.concatenate([x, estimate.h, estimate.d])
-        none = (np.zeros((0, size)) for size in (self.model.n_y, self.model.n_u, self.model.n_w))
+        ys, us, ws = (np.zeros((0, size)) for size in (self.model.n_y, self.model.n_u, self.model.n_w))
         return WindowEstimate(
-            estimate.t, x, estimate.h, estimate.d, estimate.P, estimate.innovation, estimate.nis, z[None], *none,
+            estimate.t, x, estimate.h, estimate.d, estimate.P, estimate.innovation, estimate.nis, z[None], ys, us, ws,
             z, estimate.P, w=estimate.w,
         )  # fmt: skip
 
@@ -206,7 +206,8 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             first, first_p = self._later(own)
         return WindowEstimate(
             ahead.t, x, ahead.h, ahead.d, ahead.P, ahead.innovation, ahead.nis,
-            np.vstack([own.z[gone:], np.concatenate([x, ahead.h, ahead.d])]), np.vstack([own.ys[gone:], ahead.innovation]),
+            np.vstack([own.z[gone:], np.concatenate([x, ahead.h, ahead.d])]),
+            np.vstack([own.ys[gone:], ahead.innovation]),  # NaN: nothing is measured yet
             np.vstack([own.us[gone:], sampled(u, (self.model.n_u,), "u")]), np.vstack([own.ws[gone:], ahead.w]),
             first, first_p, w=ahead.w,
         )  # fmt: skip
@@ -234,8 +235,12 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         x, h, d = np.split(z, np.cumsum(self._sizes[:2]))
         return replace(own, x=x, h=h, d=d, w=w)
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite falls back to the filter
-    def assess(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> tuple[WindowEstimate, float]:
+    @np.errstate(
+        over="ignore", invalid="ignore", divide="ignore"
+    )  # what is not finite falls back to the filter
+    def assess(
+        self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None
+    ) -> tuple[WindowEstimate, float]:
         """Estimate after the measurement ``y`` ``(n_y,)``, and the log-likelihood of the measurement, without its
         constant. If the window has no solution, or one that its noise makes impossible, the estimate starts anew.
         """
@@ -380,7 +385,9 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         from_time = np.searchsorted(time, np.arange(m + 1)).tolist()
         for k in range(m, 0, -1):
             later = by_z[from_time[k] :]
-            found[from_time[k] :, n + (k - 1) * n_noisy : n + k * n_noisy] = later[:, self._noisy] * self._sigma
+            found[from_time[k] :, n + (k - 1) * n_noisy : n + k * n_noisy] = (
+                later[:, self._noisy] * self._sigma
+            )
             by_z[from_time[k] :] = later @ f[k - 1]
         found[:, :n] = by_z @ first_root
         return found

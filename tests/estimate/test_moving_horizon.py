@@ -59,7 +59,13 @@ def emptied(model, n, seed=0):
     return np.array(ys), us
 
 
-TANK = {"sigma_y": [0.02], "sigma_x": [0.02, 0.02], "sigma_x0": [0.2, 0.02], "sigma_d": [0.01], "sigma_d0": [0.05]}
+TANK = {
+    "sigma_y": [0.02],
+    "sigma_x": [0.02, 0.02],
+    "sigma_x0": [0.2, 0.02],
+    "sigma_d": [0.01],
+    "sigma_d0": [0.05],
+}
 
 
 @pytest.mark.parametrize(("n_h", "periods"), [(0, 5), (0, 60), (3, 8)])
@@ -73,7 +79,9 @@ def test_without_bounds_and_outliers_it_is_the_kalman_filter(n_h, periods):
     for a, b in zip(got, want, strict=True):
         np.testing.assert_allclose(stacked(a), stacked(b), rtol=0, atol=1e-9)
         np.testing.assert_allclose(a.P, b.P, rtol=0, atol=1e-9)
-        np.testing.assert_allclose([*a.innovation, a.nis, a.t], [*b.innovation, b.nis, b.t], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            [*a.innovation, a.nis, a.t], [*b.innovation, b.nis, b.t], rtol=0, atol=1e-9
+        )
 
 
 def solved_by_ipopt(mhe, e, first):
@@ -90,7 +98,12 @@ def solved_by_ipopt(mhe, e, first):
     v = ca.vertcat(z[:], over, under)
     free = np.full((m + 1, n - n_x), np.inf)
     low, high = np.tile(mhe.lower, (m + 1, 1)), np.tile(mhe.upper, (m + 1, 1))
-    options = {"print_time": False, "ipopt.print_level": 0, "ipopt.tol": 1e-12, "ipopt.bound_relax_factor": 0.0}
+    options = {
+        "print_time": False,
+        "ipopt.print_level": 0,
+        "ipopt.tol": 1e-12,
+        "ipopt.bound_relax_factor": 0.0,
+    }
     solver = ca.nlpsol("mhe", "ipopt", {"x": v, "f": cost}, options)
     found = solver(
         x0=np.concatenate([e.z.ravel() + 0.01, np.ones(2 * m)]),
@@ -176,7 +189,9 @@ def rubbish(n, n_y, seed=0):
     bad = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e154, 1e9, 5.0])
     ys = 0.1 * rng.normal(size=(n, n_y))
     ys = np.where(rng.random((n, n_y)) < 0.3, bad[rng.integers(len(bad), size=(n, n_y))], ys)
-    return np.where((np.arange(n)[:, None] // 40) % 7 == 3, np.nan, ys + 3.0 * ((np.arange(n)[:, None] // 100) % 2))
+    return np.where(
+        (np.arange(n)[:, None] // 40) % 7 == 3, np.nan, ys + 3.0 * ((np.arange(n)[:, None] // 100) % 2)
+    )
 
 
 def survives(kind, model, n, **options):
@@ -195,7 +210,13 @@ def survives(kind, model, n, **options):
     np.testing.assert_allclose(e.x, model.x0, rtol=0, atol=0.05)
 
 
-PENDULUM = {"sigma_y": [1e-3], "sigma_x": [1e-3, 1e-2], "sigma_x0": [1e-2, 0.1], "sigma_d": [0.02], "sigma_d0": [0.1]}
+PENDULUM = {
+    "sigma_y": [1e-3],
+    "sigma_x": [1e-3, 1e-2],
+    "sigma_x0": [1e-2, 0.1],
+    "sigma_d": [0.02],
+    "sigma_d0": [0.1],
+}
 
 
 @pytest.mark.filterwarnings("error")
@@ -265,7 +286,9 @@ def test_measured_disturbances_act_in_their_period():
 
 
 def test_a_loop_runs_with_it():
-    model = linear_model(np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]]), np.array([[1.0, 0.0]]))
+    model = linear_model(
+        np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]]), np.array([[1.0, 0.0]])
+    )
     loop = Loop(
         MovingHorizonEstimator(model, **sigmas(model, sigma_y=[0.01], sigma_d=[0.2])),
         CondensedController(model, OCP(20, [1.0, 0.1], [0.0], [0.1], [-5.0], [5.0])), reference=[0.5, 0.0],
