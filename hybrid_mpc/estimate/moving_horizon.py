@@ -62,10 +62,9 @@ VIOLATED = 1e-9
 """Violation of a bound, in its row's standard deviations, from which its row is added."""
 MOST_ADDED = 10
 """Most times that rows of bounds are added in a step."""
-FEWEST = 3
-"""Fewest outliers that can be the majority of a window."""
-MAJORITY = 3.0
-"""Residuals up to so many times their median are released where most samples of an output are outliers."""
+ALIKE = 3.0
+"""Largest ratio of consecutive outliers on the same side that are no outliers. Of independent outliers, 2 % of the
+samples and up to 50 standard deviations, these are fewer than one in 5000 samples."""
 ROUNDING = 1e-9
 """Share of the largest multiplier within which it is reached."""
 IMPOSSIBLE = 1e5
@@ -83,6 +82,7 @@ class WindowEstimate(Estimate):
         ys: Measurements ``(m, n_y)`` of all but the first time; NaN where nothing was measured.
         us: Inputs ``(m, n_u)`` held over the periods.
         ws: Measured disturbances ``(m, n_w)`` from the beginning of each period on.
+        outliers: Which of ``ys`` had the loss's linear part ``(m, n_y)``.
         first: Mean ``(n,)`` of the arrival cost at the first time, whose measurement it contains.
         first_p: Its covariance ``(n, n)``.
     """
@@ -91,6 +91,7 @@ class WindowEstimate(Estimate):
     ys: Array
     us: Array
     ws: Array
+    outliers: NDArray[np.bool_]
     first: Array
     first_p: Array
 
@@ -192,7 +193,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         ys, us, ws = (np.zeros((0, size)) for size in (self.model.n_y, self.model.n_u, self.model.n_w))
         return WindowEstimate(
             estimate.t, x, estimate.h, estimate.d, estimate.P, estimate.innovation, estimate.nis, z[None], ys, us, ws,
-            z, estimate.P, w=estimate.w,
+            ys > 0, z, estimate.P, w=estimate.w,
         )  # fmt: skip
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
@@ -209,7 +210,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             np.vstack([own.z[gone:], np.concatenate([x, ahead.h, ahead.d])]),
             np.vstack([own.ys[gone:], ahead.innovation]),  # NaN: nothing is measured yet
             np.vstack([own.us[gone:], sampled(u, (self.model.n_u,), "u")]), np.vstack([own.ws[gone:], ahead.w]),
-            first, first_p, w=ahead.w,
+            np.vstack([own.outliers[gone:], np.zeros(self.model.n_y, dtype=bool)]), first, first_p, w=ahead.w,
         )  # fmt: skip
 
     def _later(self, own: WindowEstimate) -> tuple[Array, Array]:
@@ -224,11 +225,10 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         p = f @ own.first_p @ f.T
         p.flat[:: p.shape[0] + 1] += self._noise
         y_hat, c = self._predicted(after, u)
-        residual = (y - y_hat) / self._sigma_y
-        usual = np.abs(residual) <= self.huber  # False for NaN
-        step, p, *_ = absorbed(p, c, y - y_hat - c @ (first - own.z[1]), self._noise_y, usual)
-        # gradient of the loss's linear part; a missing sample has none
-        force = np.where(usual | ~np.isfinite(y), 0.0, self.huber * np.sign(residual) / self._sigma_y)
+        innovation, outlier = y - y_hat - c @ (first - own.z[1]), own.outliers[0]
+        step, p, *_ = absorbed(p, c, innovation, self._noise_y, np.isfinite(y) & ~outlier)
+        # gradient of the loss's linear part
+        force = np.where(outlier, self.huber * np.sign(y - y_hat) / self._sigma_y, 0.0)
         return first + step + p @ (c.T @ force), p
 
     def _at(self, own: WindowEstimate, z: Array, w: Array) -> Estimate:
@@ -253,13 +253,23 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             return self._alone(filtered), likelihood
         ys = own.ys.copy()
         ys[-1] = y
-        z, outlier = self._solved(own, ys)
+        z, outliers = self._solved(own, ys)
         if not np.isfinite(z).all():
             return self.start(y, own.t, w=own.w), likelihood
         x, h, d = np.split(z[-1], np.cumsum(self._sizes[:2]))
-        p = super().assess(own, np.where(outlier, np.nan, y), u)[0].P if outlier.any() else filtered.P
+        last = outliers[-1]
+        p = super().assess(own, np.where(last, np.nan, y), u)[0].P if last.any() else filtered.P
         return replace(
-            own, x=x, h=h, d=d, P=p, innovation=filtered.innovation, nis=filtered.nis, z=z, ys=ys
+            own,
+            x=x,
+            h=h,
+            d=d,
+            P=p,
+            innovation=filtered.innovation,
+            nis=filtered.nis,
+            z=z,
+            ys=ys,
+            outliers=outliers,
         ), likelihood
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> WindowEstimate:
@@ -267,23 +277,22 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         return self.assess(estimate, y, u)[0]
 
     def _solved(self, own: WindowEstimate, ys: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Trajectory ``(m + 1, n)`` of the window, and the outliers ``(n_y,)`` among its last outputs."""
-        z, first_root = own.z, root(own.first_p)
-        outlier = np.zeros(self.model.n_y, dtype=bool)
+        """Trajectory ``(m + 1, n)`` of the window, and the outliers ``(m, n_y)``."""
+        z, outliers, first_root = own.z, own.outliers, root(own.first_p)
         if not np.isfinite(first_root).all():
-            return np.full_like(z, np.nan), outlier
+            return np.full_like(z, np.nan), outliers
         size = np.sqrt(np.maximum(np.diag(own.P), 0.0))
         for _ in range(self.iterations):
             last = z
-            z, outlier = self._improved(own, ys, last, first_root)
+            z, outliers = self._improved(own, ys, last, first_root)
             if not np.isfinite(z).all() or np.all(np.abs(z - last) <= CONVERGED * size):
                 break
-        return z, outlier
+        return z, outliers
 
     def _improved(
         self, own: WindowEstimate, ys: Array, z: Array, first_root: Array
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """The linearized problem's solution, and the outliers among its last outputs."""
+        """The linearized problem's solution, and the outliers ``(m, n_y)``."""
         f, defects, y_hat, c = self._linearized(own, z)
         n_x, start, seen = self._sizes[0], own.first - z[0], np.isfinite(ys)
         time, output = np.nonzero(seen)  # sorted by time
@@ -297,7 +306,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         for _ in range(MOST_ADDED):
             xi = multipliers @ x
             if not np.abs(xi).max(initial=0.0) < IMPOSSIBLE:
-                return np.full_like(z, np.nan), np.zeros(ys.shape[1], dtype=bool)
+                return np.full_like(z, np.nan), own.outliers
             moved = z + self._moved(f, defects, start, xi, first_root)
             below, above = moved[:, :n_x] < self.lower, moved[:, :n_x] > self.upper
             k, i = np.nonzero((below | above) & ~held)
@@ -319,17 +328,16 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             high = np.append(high, np.where(above[k, i], 0.0, STRONGEST))
             multipliers = _box_qp(x @ x.T + np.diag(noise), e, low, high)
         moved[:, :n_x] = np.clip(moved[:, :n_x], self.lower, self.upper)  # the QP keeps them within rounding
-        last = time == len(ys) - 1
-        outlier = np.zeros(ys.shape[1], dtype=bool)
-        outlier[output[last]] = np.abs(multipliers[: time.size][last]) >= self.huber * (1 - ROUNDING)
-        return moved, outlier
+        outliers = np.zeros(ys.shape, dtype=bool)
+        outliers[seen] = np.abs(multipliers[: time.size]) >= high[: time.size] * (1 - ROUNDING)
+        return moved, outliers
 
     def _robust(self, h: Array, e: Array, output: NDArray[np.int64]) -> tuple[Array, Array, Array]:
         """Multipliers of the measurements without bounds, their limits, and the residuals ``e`` without excess.
 
-        The limit is ``huber``, the derivative of the loss's linear part. Where most samples of an output are outliers,
-        the estimate is wrong and not the sensor (a first sample that was an outlier, an unknown jump): those near their
-        median are then weighed by squares.
+        The limit is ``huber``, the derivative of the loss's linear part. Where consecutive outliers are alike, the
+        estimate is wrong and not the sensor (an unknown jump of the load, a first sample that was an outlier): they
+        have the quadratic loss.
         """
         most = np.full(e.size, self.huber)
         if not np.isfinite(self.huber):
@@ -339,13 +347,10 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         e = np.clip(e, -far, far)
         found = _box_qp(h, e, -most, most)
         outlier = np.abs(found) >= self.huber * (1 - ROUNDING)
-        released = np.zeros(e.size, dtype=bool)
+        released, size = np.zeros(e.size, dtype=bool), np.where(outlier, e, 0.0) / np.sqrt(h.diagonal())
         for i in np.unique(output[outlier]):
-            own = output == i
-            count = int(np.count_nonzero(outlier[own]))
-            if count >= FEWEST and 2 * count > np.count_nonzero(own):
-                size = np.abs(e) / np.sqrt(h.diagonal())
-                released |= own & (size <= MAJORITY * np.median(size[own]))
+            own = np.flatnonzero(output == i)
+            released[own] = _in_run(size[own])
         if released.any():
             most[released] = np.inf
             found = _box_qp(h, e, -most, most)
@@ -405,6 +410,14 @@ def _forward(f: Array, added: Array, first: Array) -> Array:
     for k in range(len(f)):
         dz[k + 1] += f[k] @ dz[k]
     return dz
+
+
+def _in_run(e: Array) -> NDArray[np.bool_]:
+    """Outliers ``(n,)`` of one output beside an outlier of the same side and size; ``e`` is 0 for other samples."""
+    one, next_one = e[:-1], e[1:]
+    small, large = np.sort(np.abs([one, next_one]), axis=0)
+    pair = np.append(False, (np.sign(one) * np.sign(next_one) > 0) & (large <= ALIKE * small))
+    return np.asarray(pair | np.append(pair[1:], False))
 
 
 def _box_qp(h: Array, e: Array, lower: Array, upper: Array) -> Array:
