@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, absorbed
 from hybrid_mpc.estimate.roots import root
-from hybrid_mpc.model.active_set import ActiveSet, RowQP
+from hybrid_mpc.model.active_set import Active, ActiveSet, RowQP
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.limits import MOST_ITERATIONS, numbers, sampled, whole
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
@@ -82,7 +82,7 @@ class WindowEstimate(Estimate):
         ys: Measurements ``(m, n_y)`` of all but the first time; NaN where nothing was measured.
         us: Inputs ``(m, n_u)`` held over the periods.
         ws: Measured disturbances ``(m, n_w)`` from the beginning of each period on.
-        outliers: Which of ``ys`` had the loss's linear part ``(m, n_y)``.
+        outliers: Sign of the residuals of ``ys`` with the loss's linear part, 0 for others ``(m, n_y)``.
         first: Mean ``(n,)`` of the arrival cost at the first time, whose measurement it contains.
         first_p: Its covariance ``(n, n)``.
     """
@@ -91,7 +91,7 @@ class WindowEstimate(Estimate):
     ys: Array
     us: Array
     ws: Array
-    outliers: NDArray[np.bool_]
+    outliers: Active
     first: Array
     first_p: Array
 
@@ -193,7 +193,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         ys, us, ws = (np.zeros((0, size)) for size in (self.model.n_y, self.model.n_u, self.model.n_w))
         return WindowEstimate(
             estimate.t, x, estimate.h, estimate.d, estimate.P, estimate.innovation, estimate.nis, z[None], ys, us, ws,
-            ys > 0, z, estimate.P, w=estimate.w,
+            ys.astype(np.int8), z, estimate.P, w=estimate.w,
         )  # fmt: skip
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
@@ -210,7 +210,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             np.vstack([own.z[gone:], np.concatenate([x, ahead.h, ahead.d])]),
             np.vstack([own.ys[gone:], ahead.innovation]),  # NaN: nothing is measured yet
             np.vstack([own.us[gone:], sampled(u, (self.model.n_u,), "u")]), np.vstack([own.ws[gone:], ahead.w]),
-            np.vstack([own.outliers[gone:], np.zeros(self.model.n_y, dtype=bool)]), first, first_p, w=ahead.w,
+            np.vstack([own.outliers[gone:], np.zeros(self.model.n_y, dtype=np.int8)]), first, first_p, w=ahead.w,
         )  # fmt: skip
 
     def _later(self, own: WindowEstimate) -> tuple[Array, Array]:
@@ -226,9 +226,9 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         p.flat[:: p.shape[0] + 1] += self._noise
         y_hat, c = self._predicted(after, u)
         innovation, outlier = y - y_hat - c @ (first - own.z[1]), own.outliers[0]
-        step, p, *_ = absorbed(p, c, innovation, self._noise_y, np.isfinite(y) & ~outlier)
+        step, p, *_ = absorbed(p, c, innovation, self._noise_y, np.isfinite(y) & (outlier == 0))
         # gradient of the loss's linear part
-        force = np.where(outlier, self.huber * np.sign(y - y_hat) / self._sigma_y, 0.0)
+        force = np.where(outlier != 0, outlier * self.huber / self._sigma_y, 0.0)
         return first + step + p @ (c.T @ force), p
 
     def _at(self, own: WindowEstimate, z: Array, w: Array) -> Estimate:
@@ -257,7 +257,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         if not np.isfinite(z).all():
             return self.start(y, own.t, w=own.w), likelihood
         x, h, d = np.split(z[-1], np.cumsum(self._sizes[:2]))
-        last = outliers[-1]
+        last = outliers[-1] != 0
         p = super().assess(own, np.where(last, np.nan, y), u)[0].P if last.any() else filtered.P
         return replace(
             own,
@@ -276,7 +276,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`."""
         return self.assess(estimate, y, u)[0]
 
-    def _solved(self, own: WindowEstimate, ys: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def _solved(self, own: WindowEstimate, ys: Array) -> tuple[Array, Active]:
         """Trajectory ``(m + 1, n)`` of the window, and the outliers ``(m, n_y)``."""
         z, outliers, first_root = own.z, own.outliers, root(own.first_p)
         if not np.isfinite(first_root).all():
@@ -289,9 +289,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
                 break
         return z, outliers
 
-    def _improved(
-        self, own: WindowEstimate, ys: Array, z: Array, first_root: Array
-    ) -> tuple[Array, NDArray[np.bool_]]:
+    def _improved(self, own: WindowEstimate, ys: Array, z: Array, first_root: Array) -> tuple[Array, Active]:
         """The linearized problem's solution, and the outliers ``(m, n_y)``."""
         f, defects, y_hat, c = self._linearized(own, z)
         n_x, start, seen = self._sizes[0], own.first - z[0], np.isfinite(ys)
@@ -301,7 +299,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         e = np.clip(error[seen], -FARTHEST, FARTHEST)
         x = self._back(f, c[seen] / self._sigma_y[output][:, None], time + 1, first_root)
         noise = np.ones(e.size)
-        multipliers, high, e = self._robust(x @ x.T + np.diag(noise), e, output)
+        multipliers, high, e = self._robust(x @ x.T + np.diag(noise), e, output, own.outliers[seen])
         low, held = -high, np.zeros((len(z), n_x), dtype=bool)
         for _ in range(MOST_ADDED):
             xi = multipliers @ x
@@ -328,11 +326,14 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             high = np.append(high, np.where(above[k, i], 0.0, STRONGEST))
             multipliers = _box_qp(x @ x.T + np.diag(noise), e, low, high)
         moved[:, :n_x] = np.clip(moved[:, :n_x], self.lower, self.upper)  # the QP keeps them within rounding
-        outliers = np.zeros(ys.shape, dtype=bool)
-        outliers[seen] = np.abs(multipliers[: time.size]) >= high[: time.size] * (1 - ROUNDING)
+        outliers = np.zeros(ys.shape, dtype=np.int8)
+        found = multipliers[: time.size]
+        outliers[seen] = np.where(np.abs(found) >= high[: time.size] * (1 - ROUNDING), np.sign(found), 0.0)
         return moved, outliers
 
-    def _robust(self, h: Array, e: Array, output: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    def _robust(
+        self, h: Array, e: Array, output: NDArray[np.int64], last: Active
+    ) -> tuple[Array, Array, Array]:
         """Multipliers of the measurements without bounds, their limits, and the residuals ``e`` without excess.
 
         The limit is ``huber``, the derivative of the loss's linear part. Where consecutive outliers are alike, the
@@ -345,7 +346,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         # l_i is at its limit in any case if |e_i| > huber sum_j |h_ij|; larger numbers only cost digits
         far = FAR * self.huber * np.sum(np.abs(h), axis=1)
         e = np.clip(e, -far, far)
-        found = _box_qp(h, e, -most, most)
+        found = _box_qp(h, e, -most, most, last)
         outlier = np.abs(found) >= self.huber * (1 - ROUNDING)
         released, size = np.zeros(e.size, dtype=bool), np.where(outlier, e, 0.0) / np.sqrt(h.diagonal())
         for i in np.unique(output[outlier]):
@@ -353,7 +354,9 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             released[own] = _in_run(size[own])
         if released.any():
             most[released] = np.inf
-            found = _box_qp(h, e, -most, most)
+            found = _box_qp(
+                h, e, -most, most, np.where(released, 0, np.sign(found) * outlier).astype(np.int8)
+            )
         return found, most, e
 
     def _linearized(self, own: WindowEstimate, z: Array) -> tuple[Array, Array, Array, Array]:
@@ -420,11 +423,10 @@ def _in_run(e: Array) -> NDArray[np.bool_]:
     return np.asarray(pair | np.append(pair[1:], False))
 
 
-def _box_qp(h: Array, e: Array, lower: Array, upper: Array) -> Array:
-    """``argmin 1/2 l'hl - e'l`` within bounds; NaN without a finite solution."""
-    rows = np.zeros((0, e.size))
-    qp = RowQP(h, -e, rows, lower, upper, np.full(e.size, np.inf), np.zeros(e.size))
-    return ActiveSet(qp).solve().s
+def _box_qp(h: Array, e: Array, lower: Array, upper: Array, active: Active | None = None) -> Array:
+    """``argmin 1/2 l'hl - e'l`` within bounds, starting from active ones; NaN without a finite solution."""
+    qp = RowQP(h, -e, np.zeros((0, e.size)), lower, upper, np.full(e.size, np.inf), np.zeros(e.size))
+    return ActiveSet(qp).solve(active).s
 
 
 def _bounds(model: HybridModel, lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[Array, Array]:
