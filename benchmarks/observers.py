@@ -2,15 +2,16 @@
 
     python benchmarks/observers.py [--machines two_tanks] [--seeds 10] [--periods 200]
 
-The machine is the model with the assumed process and sensor noise (so the Kalman filter is right, up to curvature), under
-random steps of its inputs. Each case changes one thing:
+The machine is the model with the assumed process and sensor noise (so the Kalman filter is right, up to curvature),
+under random steps of its inputs. Each case changes one thing:
 
 - ``clean``: nothing.
 - ``outliers``: 2 % of the samples are off by 5 to 50 standard deviations of the sensor, to either side.
 - ``missing``: 20 % of the samples are missing.
 - ``bound``: the tanks run empty, with a pulse of the pump now and then; only for the machine with a bound.
 - ``load``: an unmeasured load of 10 % of the inputs' range begins in the middle.
-- ``poor start``: the first sample is off by 100 standard deviations, and states without a sensor by 3 of their first ones.
+- ``poor start``: the first sample is off by 100 standard deviations, and states without a sensor by 3 of their first
+  ones.
 
 The error is the root mean square over periods and states, each state over its size. A ratio is the geometric mean over
 seeds (paired: the same machine, noise and inputs) with its 95 % interval, by Student's t of the logarithms. All filters
