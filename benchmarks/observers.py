@@ -1,6 +1,6 @@
 """Which observer when: errors of the kinds of ``kit.observer`` over those of the extended Kalman filter.
 
-    python benchmarks/observers.py [--machines two_tanks] [--seeds 10] [--periods 200]
+    python benchmarks/observers.py [--machines two_tanks] [--seeds 10] [--periods 200] [--z 8 32]
 
 The machine is the model with the assumed process and sensor noise (so the Kalman filter is right, up to curvature),
 under random steps of its inputs. Each case changes one thing:
@@ -15,8 +15,8 @@ under random steps of its inputs. Each case changes one thing:
 
 The error is the root mean square over periods and states, each state over its size. A ratio is the geometric mean over
 seeds (paired: the same machine, noise and inputs) with its 95 % interval, by Student's t of the logarithms. All filters
-but ``switching`` have the same noise; ``switching`` is the default observer of a kit. ``ms`` is the median of the
-processor time of a period, all cases together.
+but ``switching`` have the same noise; ``switching`` is the default observer of a kit. The second table is the median
+processor time of a period, all cases together, and that of the golf robot with a network of ``z`` units.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pathlib import Path
 from time import thread_time
 
 import numpy as np
-from parts import arguments, report
+from parts import arguments, deployed, hybrid_step, report
 from scipy.stats import t as student
 
 import hybrid_mpc as hm
@@ -89,7 +89,9 @@ def experiment(kit: hm.Kit, case: str, seed: int, periods: int) -> tuple[np.ndar
     return np.array(xs), y, us
 
 
-def errors_of(kit: hm.Kit, case: str, seeds: int, periods: int, spent: dict[str, list]) -> dict[str, np.ndarray]:
+def errors_of(
+    kit: hm.Kit, case: str, seeds: int, periods: int, spent: dict[str, list]
+) -> dict[str, np.ndarray]:
     """Errors by kind of observer ``(seeds,)``."""
     sizes = Sizes(kit.models["prior"], kit.problem()).states
     found: dict[str, list] = {kind: [] for kind in KINDS}
@@ -108,6 +110,31 @@ def errors_of(kit: hm.Kit, case: str, seeds: int, periods: int, spent: dict[str,
     return {kind: np.array(values) for kind, values in found.items()}
 
 
+def times_of(z: int) -> dict[str, list]:
+    """Processor times [ms] of periods of the golf robot with a network of ``z`` units, without outliers."""
+    model, rng = deployed(hybrid_step(z)), np.random.default_rng(0)
+    sigmas = {
+        "sigma_y": [5e-4],
+        "sigma_x": [1e-4, 5e-3],
+        "sigma_x0": [5e-4, 0.1],
+        "sigma_d": [3e-4],
+        "sigma_d0": [1e-3],
+    }
+    filters = hm.ExtendedKalmanFilter, hm.UnscentedKalmanFilter, hm.MovingHorizonEstimator
+    found: dict[str, list] = {}
+    for kind, make in zip(KINDS, filters, strict=False):
+        observer = make(model, **sigmas)
+        estimate, found[kind], x = observer.start([0.0]), [], np.zeros(2)
+        h = estimate.h
+        for _ in range(200):
+            x, h = (v.full().ravel() for v in model.step(x, h, [0.02], model.w, model.p))
+            y = x[:1] + 5e-4 * rng.standard_normal(1)
+            begin = thread_time()
+            estimate = observer.update(estimate, y, [0.02])
+            found[kind].append(1e3 * (thread_time() - begin))
+    return found
+
+
 def ratio(mine: np.ndarray, other: np.ndarray) -> str:
     """Geometric mean of the paired ratios with its 95 % interval."""
     logs = np.log(mine / other)
@@ -122,6 +149,7 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=[*NOISE], choices=[*NOISE])
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--periods", type=int, default=200)
+    parser.add_argument("--z", type=int, nargs="+", default=[8, 32])
     asked = parser.parse_args()
     rows, times = [], []
     for name in asked.machines:
@@ -134,6 +162,10 @@ def main() -> None:
             rows.append({"case": case, "machine": name, **ratios})
             print(rows[-1], flush=True)
         times.append({"machine": name, **{f"{kind} [ms]": float(np.median(spent[kind])) for kind in KINDS}})
+    for z in asked.z:
+        found = times_of(z)
+        own = {f"{kind} [ms]": float(np.median(values)) for kind, values in found.items()}
+        times.append({"machine": f"golf_robot, {z} units", **own, f"{KINDS[-1]} [ms]": float("nan")})
     rows.sort(key=lambda row: CASES.index(row["case"]))
     report([*rows, *times], asked.out)
 
