@@ -48,6 +48,8 @@ from hybrid_mpc.model.stages import stages
 Array = NDArray[np.float64]
 HUBER = 2.0
 """Residual, in the sensor's standard deviations, from which the loss is linear."""
+JUMP = 3.0
+"""Step of a disturbance per period, in its standard deviations, from which the loss is linear."""
 MOST_PERIODS = 1000
 """Most periods of a window; its cost grows with their square."""
 FARTHEST = 1e100
@@ -157,6 +159,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
         huber: float = HUBER,
+        jump: float = JUMP,
         iterations: int = 1,
     ) -> None:
         super().__init__(
@@ -165,20 +168,24 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         )  # fmt: skip
         self.periods = whole(periods, "periods", 1, MOST_PERIODS)
         self.iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
-        self.huber = float(numbers([huber], "huber")[0])
-        if not self.huber > 0:
-            raise InputError(f"huber: must be positive, got {huber} [HM-ESTIMATE-028]")
+        self.huber, self.jump = (
+            float(numbers([value], name)[0]) for name, value in (("huber", huber), ("jump", jump))
+        )
+        if not min(self.huber, self.jump) > 0:
+            raise InputError(f"huber, jump: must be positive, got {huber} and {jump} [HM-ESTIMATE-028]")
         self.lower, self.upper = _bounds(model, lower, upper)
         self._sigma_y = np.sqrt(self._noise_y)
         self._noisy = np.flatnonzero(self._noise)
         self._sigma = np.sqrt(self._noise[self._noisy])
+        jumping = (self._noisy >= model.n_x + model.n_h) & np.isfinite(self.jump)
+        self._jumping = np.flatnonzero(jumping)
         self._stages = stages(model, self.periods)
         self._outputs = BufferedFunction(output_with_jacobian(model).map(self.periods))
 
     def same_on(self, model: HybridModel, **sigmas: Array) -> MovingHorizonEstimator:
         """See :meth:`ExtendedKalmanFilter.same_on`; window, bounds and loss are the same."""
         return MovingHorizonEstimator(
-            model, periods=self.periods, lower=self.lower, upper=self.upper, huber=self.huber,
+            model, periods=self.periods, lower=self.lower, upper=self.upper, huber=self.huber, jump=self.jump,
             iterations=self.iterations, **sigmas,
         )  # fmt: skip
 
@@ -223,7 +230,11 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         moved = np.concatenate([x + self._on_x @ before.d, h, before.d])
         first = moved + f @ (own.first - own.z[0])
         p = f @ own.first_p @ f.T
-        p.flat[:: p.shape[0] + 1] += self._noise
+        # a jump enters as by the quadratic loss of the same slope: its noise is larger by |step| / (jump sigma)
+        noise, on_d = self._noise.copy(), slice(len(x) + len(h), None)
+        step = np.abs(own.z[1] - own.z[0])[on_d]
+        noise[on_d] = np.maximum(noise[on_d], np.sqrt(noise[on_d]) * step / self.jump)
+        p.flat[:: p.shape[0] + 1] += noise
         y_hat, c = self._predicted(after, u)
         innovation, outlier = y - y_hat - c @ (first - own.z[1]), own.outliers[0]
         step, p, *_ = absorbed(p, c, innovation, self._noise_y, np.isfinite(y) & (outlier == 0))
@@ -299,10 +310,9 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         e = np.clip(error[seen], -FARTHEST, FARTHEST)
         x = self._back(f, c[seen] / self._sigma_y[output][:, None], time + 1, first_root)
         noise = np.ones(e.size)
-        multipliers, high, e = self._robust(x @ x.T + np.diag(noise), e, output, own.outliers[seen])
+        multipliers, xi, high, e = self._robust(x, e, output, own.outliers[seen])
         low, held = -high, np.zeros((len(z), n_x), dtype=bool)
         for _ in range(MOST_ADDED):
-            xi = multipliers @ x
             if not np.abs(xi).max(initial=0.0) < IMPOSSIBLE:
                 return np.full_like(z, np.nan), own.outliers
             moved = z + self._moved(f, defects, start, xi, first_root)
@@ -324,7 +334,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             noise = np.append(noise, np.full(k.size, NOISE_OF_BOUND))
             low = np.append(low, np.where(above[k, i], -STRONGEST, 0.0))
             high = np.append(high, np.where(above[k, i], 0.0, STRONGEST))
-            multipliers = _box_qp(x @ x.T + np.diag(noise), e, low, high)
+            multipliers, xi = self._dual(x, noise, e, low, high)
         moved[:, :n_x] = np.clip(moved[:, :n_x], self.lower, self.upper)  # the QP keeps them within rounding
         outliers = np.zeros(ys.shape, dtype=np.int8)
         found = multipliers[: time.size]
@@ -332,21 +342,23 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         return moved, outliers
 
     def _robust(
-        self, h: Array, e: Array, output: NDArray[np.int64], last: Active
-    ) -> tuple[Array, Array, Array]:
-        """Multipliers of the measurements without bounds, their limits, and the residuals ``e`` without excess.
+        self, x: Array, e: Array, output: NDArray[np.int64], last: Active
+    ) -> tuple[Array, Array, Array, Array]:
+        """Multipliers of the measurements without bounds, unknowns ``xi``, the multipliers' limits, and the residuals
+        ``e`` without excess.
 
         The limit is ``huber``, the derivative of the loss's linear part. Where consecutive outliers are alike, the
-        estimate is wrong and not the sensor (an unknown jump of the load, a first sample that was an outlier): they
-        have the quadratic loss.
+        estimate is wrong and not the sensor (a first sample that was an outlier, an unknown jump): they have the
+        quadratic loss.
         """
-        most = np.full(e.size, self.huber)
+        noise, most = np.ones(e.size), np.full(e.size, self.huber)
         if not np.isfinite(self.huber):
-            return _box_qp(h, e, -most, most), most, e
+            return *self._dual(x, noise, e, -most, most), most, e
+        h = x @ x.T + np.diag(noise)
         # l_i is at its limit in any case if |e_i| > huber sum_j |h_ij|; larger numbers only cost digits
         far = FAR * self.huber * np.sum(np.abs(h), axis=1)
         e = np.clip(e, -far, far)
-        found = _box_qp(h, e, -most, most, last)
+        found, xi = self._dual(x, noise, e, -most, most, last)
         outlier = np.abs(found) >= self.huber * (1 - ROUNDING)
         released, size = np.zeros(e.size, dtype=bool), np.where(outlier, e, 0.0) / np.sqrt(h.diagonal())
         for i in np.unique(output[outlier]):
@@ -354,10 +366,26 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             released[own] = _in_run(size[own])
         if released.any():
             most[released] = np.inf
-            found = _box_qp(
-                h, e, -most, most, np.where(released, 0, np.sign(found) * outlier).astype(np.int8)
-            )
-        return found, most, e
+            active = np.where(released, 0, np.sign(found) * outlier).astype(np.int8)
+            found, xi = self._dual(x, noise, e, -most, most, active)
+        return found, xi, most, e
+
+    def _dual(
+        self, x: Array, noise: Array, e: Array, low: Array, high: Array, active: Active | None = None
+    ) -> tuple[Array, Array]:
+        """Solution ``l`` of the dual problem, and unknowns ``xi``; NaN without a finite solution."""
+        m = (x.shape[1] - self._noise.size) // max(self._noisy.size, 1)
+        columns = self._noise.size + (self._noisy.size * np.arange(m)[:, None] + self._jumping).ravel()
+        rows, far = e.size + columns.size, np.full(columns.size, self.jump)
+        qp = RowQP(
+            x @ x.T + np.diag(noise), -e, x[:, columns].T, np.append(low, -far), np.append(high, far),
+            np.full(rows, np.inf), np.zeros(rows),
+        )  # fmt: skip
+        warm = None if active is None else np.append(active, np.zeros(columns.size, dtype=np.int8))
+        found = ActiveSet(qp).solve(warm)
+        xi = found.s @ x
+        xi[columns] += found.multipliers[e.size :]  # what a jump exceeds the quadratic part by
+        return found.s, xi
 
     def _linearized(self, own: WindowEstimate, z: Array) -> tuple[Array, Array, Array, Array]:
         """Along a trajectory: slopes ``(m, n, n)`` and defects ``(m, n)`` of the periods, outputs ``(m, n_y)`` of all
@@ -421,12 +449,6 @@ def _in_run(e: Array) -> NDArray[np.bool_]:
     small, large = np.sort(np.abs([one, next_one]), axis=0)
     pair = np.append(False, (np.sign(one) * np.sign(next_one) > 0) & (large <= ALIKE * small))
     return np.asarray(pair | np.append(pair[1:], False))
-
-
-def _box_qp(h: Array, e: Array, lower: Array, upper: Array, active: Active | None = None) -> Array:
-    """``argmin 1/2 l'hl - e'l`` within bounds, starting from active ones; NaN without a finite solution."""
-    qp = RowQP(h, -e, np.zeros((0, e.size)), lower, upper, np.full(e.size, np.inf), np.zeros(e.size))
-    return ActiveSet(qp).solve(active).s
 
 
 def _bounds(model: HybridModel, lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[Array, Array]:
