@@ -35,6 +35,24 @@ def random_linear(seed, n_x=3, n_u=2, n_y=1, n_h=0, radius=0.98):
     return linear_model(a, b, c, n_h=n_h), a, b, c
 
 
+def runaway(bound):
+    """``x+ = 1.5 x + u`` in the declared range ``-bound .. bound``; with inputs up to 0.1 it leaves 0.9 for 2,900."""
+    x, u = ca.MX.sym("x"), ca.MX.sym("u")
+    signal = Signal("x", "m", -bound, bound)
+    return HybridModel.of(
+        "runaway",
+        1.0,
+        (signal,),
+        (Signal("u", "-"),),
+        (signal,),
+        x=x,
+        u=u,
+        y=x,
+        x_next=1.5 * x + u,
+        xdot=0.5 * x + u,
+    )
+
+
 def make_filter(model, **changes):
     """A filter of deviations that are the same for all states, outputs and inputs."""
     sigma = {

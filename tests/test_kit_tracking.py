@@ -1,6 +1,7 @@
 """A kit that names tracked parameters: its files, its observer and controller in a loop, and what has no C."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,12 @@ from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.estimate.tracking import DAY, TrackedParameter
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.kit.artifact import build_model
-from hybrid_mpc.kit.parts import loop_settings, save_loop
+from hybrid_mpc.kit.parts import WatchFile, loop_settings, save_loop
 
+LIMITS = hm.WatchLimits(
+    "residuals", DT, (hm.ChannelLimit("lower", "m", 1, 2e-3, 1e-3),), (np.inf,), (0,),
+    time_unit=1.0,
+)  # fmt: skip
 TRACKED = (TrackedParameter("k", 0.2, relative=True),)
 
 
@@ -82,3 +87,45 @@ def test_c_refuses_an_observer_that_tracks(kit, tmp_path):
     observer = kit.tracking_observer()
     with pytest.raises(hm.InputError, match=r"TrackingFilter.*HM-EMBEDDED-011"):
         write_controller(tmp_path / "c", observer.model, OCP, estimator=observer)
+
+
+@pytest.mark.parametrize("w", [[5e-5], [5e-5, np.nan], [[5e-5], [5e-5]]])
+def test_measured_disturbances_come_with_or_without_the_tracked_ones(kit, w):
+    loop = hm.Loop(kit.tracking_observer(), kit.controller(tracking=True), reference=[0.4])
+    loop.start(kit.models["prior"].x0[1:], w=w)
+    assert loop.n_measured == 1
+    assert loop.estimate.w[0] == 5e-5
+    with pytest.raises(hm.InputError, match="HM-MODEL-019"):
+        loop.step([0.3], w=[1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(("k", "named"), [(6e-4, False), (9.5e-4, True)])
+def test_the_monitor_tells_drift_from_a_machine_beyond_it(folder, kit, k, named):
+    """The fitted value is 5e-4, the standard deviation between recordings a fifth of it.
+
+    Its readings with fitted parameters are at most 4e-4 m at 5e-4, the limit is five times that.
+    """
+
+    def steps(t):
+        return np.where((t // 600) % 2 == 0, 0.4, 0.3)[:, None]
+
+    kit = replace(kit, watch={"prior": WatchFile({"residuals": LIMITS})})
+    programs = {f"prior/{name}": p for name, p in prior_programs(Tanks({"k": k}), DT).items()}
+    plant, model = build_model("prior", programs, hm.model_info(Tanks({"k": k}), DT)), kit.models["prior"]
+    alarms = {}
+    for tracking in (False, True):
+        observer = kit.tracking_observer() if tracking else kit.observer()
+        monitor = kit.monitor(tracking=tracking)
+        loop = hm.Loop(observer, kit.controller(tracking=tracking), monitor=monitor, reference=steps)
+        x, rng, seen = model.x0, np.random.default_rng(0), []
+        u = loop.start(x[1:], w=[5e-5])
+        for _ in range(300):
+            x = plant.step(x, [], u, [5e-5], plant.p)[0].full().ravel()
+            loop.finish()
+            seen.append(loop.reading.channels)
+            u = loop.step(x[1:] + 1e-4 * rng.standard_normal(1), w=[5e-5])
+        alarms[tracking] = {name for names in seen[150:] for name in names}
+    assert "k" not in alarms[False]
+    assert ("k" in alarms[True]) is named
+    assert alarms[False]  # without tracking, drift within its usual range alarms
+    assert named or not alarms[True]

@@ -36,12 +36,20 @@ its last plan, and from the rival plan that is cheapest by its own equations."""
 class NamedController:
     """A controller of a ``"prior"``, ``"hybrid"`` or ``"oracle"`` model with its estimator.
 
-    With ``observer`` it estimates an unknown load at the input; with ``truth`` it gets the plant's true state.
+    With ``observer`` it estimates an unknown load at the input; with ``truth`` it gets the plant's true state. With
+    ``tracking`` it also estimates the kit's tracked parameters, with ``blended`` the share of the network's correction.
     """
 
     model: str
     observer: bool = False
     truth: bool = False
+    tracking: bool = False
+    blended: bool = False
+
+    @property
+    def compared(self) -> bool:
+        """Whether every run compares it, and a monitor of the hybrid's limits can watch it."""
+        return not (self.tracking or self.blended)
 
 
 CONTROLLERS: Mapping[str, NamedController] = {
@@ -49,15 +57,27 @@ CONTROLLERS: Mapping[str, NamedController] = {
     "prior_observer": NamedController("prior", observer=True),
     "hybrid": NamedController("hybrid"),
     "hybrid_observer": NamedController("hybrid", observer=True),
+    "prior_tracking": NamedController("prior", observer=True, tracking=True),
+    "hybrid_tracking": NamedController("hybrid", observer=True, tracking=True),
+    "blended_observer": NamedController("hybrid", observer=True, blended=True),
     "oracle": NamedController("oracle", observer=True),
     "oracle_state": NamedController("oracle", truth=True),
 }
-"""Fitted prior and hybrid, each without and with disturbance observer; two oracles with the plant's own equations, one
-with the same measurements and the same kind of estimator, one with the true state."""
+"""Fitted prior and hybrid: each without and with disturbance observer, and with tracked parameters; their blend; two
+oracles with the plant's own equations, one with the same measurements and the same kind of estimator, one with the true
+state."""
 ORACLES = ("oracle", "oracle_state")
+COMPARED = tuple(name for name, c in CONTROLLERS.items() if c.compared)
+"""Controllers that a run compares."""
 OBSERVERS = ("prior_observer", "hybrid_observer")
 LEAST_NOISE: Mapping[str, str] = {"hybrid": "prior", "hybrid_observer": "prior_observer"}
 """Controller whose process noise is a lower bound, for scenarios whose tasks go beyond the recordings."""
+
+
+def noise_name(controller: str) -> str:
+    """The controller whose process noise a controller uses: the observer of the same model."""
+    own = CONTROLLERS[controller]
+    return controller if own.compared else f"{own.model}_observer"
 
 
 def build(
@@ -69,6 +89,10 @@ def build(
         InputError: If the controller is unknown, the scenario has no oracle, or the kit has no noise.
     """
     c, prior = CONTROLLERS[known(name, CONTROLLERS, "controller")], kit.models["prior"]
+    if not c.compared:
+        own = kit.blended() if c.blended else kit
+        own = replace(own, loop=replace(own.loop, control={"": control}))
+        return own.tracking_observer(c.model), own.controller(c.model, solver=solver, tracking=True)
     if c.model != "oracle":
         model = kit.models[c.model]
         estimator = make_estimator(model, kit, kit.noise(name), control, observer=c.observer)
@@ -104,7 +128,7 @@ def noise_of(scenario: Scenario, artifact: Kit, recordings: Sequence[Trajectory]
             models[c.model], scenario, errors[c.model], recordings, observer=c.observer, known=scenario.state_noise
         )
         for name, c in CONTROLLERS.items()
-        if c.model in models and not c.truth
+        if c.model in models and not c.truth and c.compared
     }  # fmt: skip
     return no_surer_than_prior(scenario, found)
 
@@ -146,7 +170,7 @@ def find_noise(
     Example:
         ``noise, source = find_noise(scenario, hm.load("runs/golf"), ("hybrid_observer",), 0)``
     """
-    needed = [name for name in controllers if not CONTROLLERS[name].truth]
+    needed = list(dict.fromkeys(noise_name(name) for name in controllers if not CONTROLLERS[name].truth))
     held = {name: artifact.noise(name) for name in artifact.loop.process_noise}
     lacking = [name for name in needed if name not in held]
     if not lacking:

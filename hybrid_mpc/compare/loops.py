@@ -129,7 +129,7 @@ class LoopSpec:
         known(self.monitor, MONITORS, "monitor")
         if self.guard:
             known(self.guard, GUARDS[1:], "guard")
-        if self.guard and (self.monitor not in ALARMING or CONTROLLERS[self.controller].model != "hybrid"):
+        if self.guard and (self.monitor not in ALARMING or not _is_watched(self.controller)):
             raise InputError(
                 f"guard: it reacts to alarms, so it needs a controller with the hybrid and monitor "
                 f"{' or '.join(ALARMING)}; got controller {self.controller} and monitor {self.monitor} [HM-COMPARE-003]"
@@ -279,6 +279,12 @@ class LoopRow:
         }
 
 
+def _is_watched(controller: str) -> bool:
+    """Whether a monitor can watch a controller: it watches the hybrid."""
+    own = CONTROLLERS[controller]
+    return own.model == "hybrid" and own.compared
+
+
 class Bench:
     """Runs loops: holds a machine, its models, and the controllers that were built for them.
 
@@ -364,7 +370,7 @@ class Bench:
 
     def monitor(self, spec: LoopSpec) -> Monitor | None:
         """The monitor of a specification, None without one; InputError if the model lacks its limits."""
-        if spec.monitor == "none" or CONTROLLERS[spec.controller].model != "hybrid":
+        if spec.monitor == "none" or not _is_watched(spec.controller):
             return None
         return self.kit(spec).monitor("hybrid", kind=spec.monitor, task=spec.task)
 
@@ -527,7 +533,7 @@ def row_of(spec: LoopSpec, task: Task, problem: OCP, model: HybridModel, result:
         errors = errors[problem.q_y > 0]
     inputs = [signal.label for signal in model.inputs]
     violation = r.violation[np.isfinite(r.violation)]
-    watched = spec.monitor != "none" and CONTROLLERS[spec.controller].model == "hybrid"
+    watched = spec.monitor != "none" and _is_watched(spec.controller)
     can_alarm = watched and spec.monitor in ALARMING
     return LoopRow(
         task=task.name,

@@ -216,7 +216,8 @@ class Study:
         >>> Study("golf_robot", "m", controllers=["hybird"])
         Traceback (most recent call last):
         hybrid_mpc.errors.InputError: no controller 'hybird'; did you mean 'hybrid'? Known names: prior, \
-prior_observer, hybrid, hybrid_observer, oracle, oracle_state
+prior_observer, hybrid, hybrid_observer, prior_tracking, hybrid_tracking, blended_observer, \
+oracle, oracle_state
     """
 
     scenario: str
@@ -372,7 +373,9 @@ prior_observer, hybrid, hybrid_observer, oracle, oracle_state
                 f"study: draws = {self.draws}, but nothing is random. Give vary or random_faults, or use seeds"
                 " [HM-COMPARE-032]"
             )
-        others = [name for name in self.controllers if CONTROLLERS[name].model != "hybrid"]
+        others = [
+            n for n in self.controllers if CONTROLLERS[n].model != "hybrid" or not CONTROLLERS[n].compared
+        ]
         alarming = [name for name in self.monitors if name in ALARMING]
         if self.guard and others:
             raise InputError(

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from hybrid_mpc.compare.controllers import CONTROLLERS, ORACLES, find_noise
+from hybrid_mpc.compare.controllers import CONTROLLERS, ORACLES, find_noise, noise_name
 from hybrid_mpc.compare.loops import (
     Bench,
     LoopSpec,
@@ -166,7 +166,8 @@ def load_inputs(
     """Runner of a study's loops, and notes of its models by label; ``held`` are the notes of a resumed study."""
     models, notes = [], {}
     for label, m in load_models(study, {k: note.noise for k, note in (held or {}).items()}).items():
-        sigma = {c: tuple(m.kit.noise(c).tolist()) for c in study.controllers if not CONTROLLERS[c].truth}
+        names = {noise_name(c): None for c in study.controllers if not CONTROLLERS[c].truth}
+        sigma = {name: tuple(m.kit.noise(name).tolist()) for name in names}
         models.append(ModelInput(label, str(m.folder.resolve()), m.sha256, tuple(sigma.items())))
         notes[label] = ModelNote(m.sha256, plain(m.kit.provenance), NoiseNote(m.noise_source, sigma))
     return LoopRunner(study.scenario, tuple(models)), notes

@@ -128,6 +128,8 @@ class IpoptController(Controller):
         found = found * self._scale
         u = np.clip(found[: u.size].reshape(u.shape), *self.ocp.bounds(u_prev, limits))
         z = found[u.size : u.size + z.size].reshape(z.shape)
+        if problem.diverges(z[1:, : self.ocp.n_x]):
+            status = Status.DIVERGED
         cost = problem.cost(z, u, u_prev, target)
         return self._plan(u, z, target, cost, status, kkt, start, count)
 

@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # BLAS takes long to import
 Array = NDArray[np.float64]
 KEPT = 1e-7
 """Violation, over its size, up to which a hard bound counts as kept: the tolerance of the solvers."""
+BEYOND = 10.0
+"""Widths of a state's declared range that a plan may lie outside of it: further out the model's prediction diverges."""
 KNOTS = 8
 """Most set-points of one preview with a steady state of their own. For a reference that changes all the time, steady
 states are interpolated between so many rows."""
@@ -42,6 +44,9 @@ class Status(Enum):
     STOPPED = "the iterations ended before convergence; the plan satisfies the model and the limits"
     INFEASIBLE = "the solution violates an input bound or the limit of its change"
     INACCURATE = "the solution fails the KKT check"
+    DIVERGED = (
+        "the plan leaves the declared range of a state by more than ten times its width: the model diverges"
+    )
     NLP_FAILED = "the nonlinear solver's solution violates the model or the limits"
     LATE = "the solve missed its deadline"
 
@@ -615,6 +620,16 @@ class Problem:
         self._no_e = fixed(np.zeros((ocp.horizon, model.n_d + model.n_w + ocp.n_p)))
         self.u_rest: Array = np.clip(model.u0, ocp.u_min, ocp.u_max)
         """Input ``(n_u,)`` of the operating point, within the limits."""
+        limits = [(-np.inf, np.inf) if s.periodic else (s.lower, s.upper) for s in model.states]
+        lower, upper = np.array(limits).reshape(-1, 2).T
+        width = BEYOND * (upper - lower)
+        self.reach: tuple[Array, Array] = lower - width, upper + width
+        """Bounds ``(n_x,)`` beyond which a plan diverges; infinite for periodic states and open ranges."""
+
+    def diverges(self, x: Array) -> bool:
+        """True if states ``(n, n_x)`` lie further outside of their declared ranges than :data:`BEYOND` widths."""
+        lower, upper = self.reach
+        return bool(((x < lower) | (x > upper)).any())
 
     def initial(self, estimate: Estimate, u: Array | None = None) -> Solution:
         """A first plan, of status INITIAL: a free run of the model from the estimate with ``u`` ``(N, n_u)``.

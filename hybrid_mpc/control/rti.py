@@ -330,7 +330,12 @@ class CondensedController(SplitController):
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
         w: Array | None = None,
     ) -> Solution:  # fmt: skip
-        """:meth:`feedback`, then further iterations up to ``iterations``; same arguments."""
+        """:meth:`feedback`, then further iterations up to ``iterations``; same arguments.
+
+        A plan that diverges (:meth:`~hybrid_mpc.control.problem.Problem.diverges`) has status DIVERGED and the inputs
+        of the shifted previous plan.
+        """
+        start = perf_counter()
         solution = self.feedback(prepared, estimate, reference, limits, w)
         for i in range(1, self.iterations):
             if not solution.status.ok:
@@ -344,6 +349,8 @@ class CondensedController(SplitController):
             solution = self.feedback(again, estimate, reference, limits, w)
             total = {name: spent[name] + solution.timing[name] for name in spent}
             solution = replace(solution, timing=total, iterations=i + 1)
+        if solution.status.ok and self.problem.diverges(solution.x[1:]):
+            return self._failed(prepared, Status.DIVERGED, start, solution.kkt)
         return solution
 
     def condense(

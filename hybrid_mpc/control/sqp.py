@@ -499,13 +499,14 @@ class SQPController(Controller):
     def _plan(self, descent: Descent, case: Case, start: float) -> Solution:
         at, n_x = descent.at.run, self.ocp.n_x
         excess = self.problem.soft.excess(at.soft[0])
+        diverges = descent.status.ok and self.problem.diverges(at.z[1:, :n_x])
         return Solution(
             u=at.u,
             x=at.z[:, :n_x],
             h=at.z[:, n_x:],
             d=case.d,
             cost=at.cost,
-            status=descent.status,
+            status=Status.DIVERGED if diverges else descent.status,
             kkt=descent.kkt,
             defect=0.0,
             timing={"solve": (perf_counter() - start) * 1e3},

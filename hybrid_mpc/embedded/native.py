@@ -23,7 +23,10 @@ Array = NDArray[np.float64]
 FLAGS = ("-std=c11", "-O3", "-march=native", "-ffp-contract=off")
 """Options of the compiler. -march=native binds the library to this processor. Without -ffp-contract=off, a fused
 multiply-add would give other rounding errors than the generated C on other processors."""
-STATUS = (Status.INITIAL, Status.SOLVED, Status.NOT_FINITE, Status.INFEASIBLE, Status.INACCURATE)
+STATUS = (
+    Status.INITIAL, Status.SOLVED, Status.NOT_FINITE, Status.INFEASIBLE, Status.INACCURATE, Status.DIVERGED,
+)  # fmt: skip
+"""Results of a solve in the order of ``hmpc_status``."""
 _BRIDGE = """
 #include "hmpc.h"
 #include <stddef.h>

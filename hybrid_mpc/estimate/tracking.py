@@ -93,6 +93,26 @@ def tracked_values(model: HybridModel, tracked: Sequence[TrackedParameter], thet
     return ca.vertcat(*found)
 
 
+def tracked_range(
+    model: HybridModel, tracked: Sequence[TrackedParameter], deviations: float = 3.0
+) -> tuple[Array, Array]:
+    """Smallest and largest values ``(n_t,)`` [their units] of tracked parameters within some standard deviations.
+
+    Example:
+        >>> x, u, p = ca.MX.sym("x"), ca.MX.sym("u"), ca.MX.sym("p")
+        >>> level = (Signal("x", "m"),)
+        >>> tank = HybridModel.of("tank", 1.0, level, (Signal("u", "-"),), level, x=x, u=u, p=p, x_next=x + p * u,
+        ...     xdot=p * u, y=x, parameters=(Parameter("k", 2.0, "m/s", -50.0, 50.0),))
+        >>> [end.round(2).tolist() for end in tracked_range(tank, [TrackedParameter("k", 0.5)])]
+        [[0.5], [3.5]]
+    """
+    ends = []
+    for sign in (-deviations, deviations):
+        theta = ca.MX(ca.DM([sign * one.std for one in tracked]))
+        ends.append(ca.evalf(tracked_values(model, tracked, theta)).full().ravel())
+    return np.minimum(*ends), np.maximum(*ends)
+
+
 def _room(p: Parameter, one: TrackedParameter) -> tuple[float, float]:
     """Largest deviation of a parameter to both sides of its fitted value."""
     if not one.relative:
@@ -174,6 +194,12 @@ def _side_by_side(base: SideBySide, n_w: int, places: Sequence[int]) -> SideBySi
     return make
 
 
+def shown_parameters(model: HybridModel) -> tuple[str, ...]:
+    """Names of the parameters in the output equation, which cannot be tracked."""
+    _, places = model.output.jac_sparsity(0, 3).get_triplet()
+    return tuple(model.parameters[i].name for i in sorted(set(places)))
+
+
 def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> HybridModel:
     """The model of the observer: deviations ``theta`` of the tracked parameters are the last hidden states.
 
@@ -183,8 +209,8 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
     _check(model, tracked)
     places, n_h = _places(model, tracked), model.n_h
     x, _, u, w, p = step_symbols(model)
-    _, shown = model.output.jac_sparsity(0, 3).get_triplet()
-    if names := [model.parameters[i].name for i in places if i in shown]:
+    shown = shown_parameters(model)
+    if names := [one.name for one in tracked if one.name in shown]:
         raise InputError(
             f"tracked parameters: {', '.join(names)} appear in the output equation of model {model.name}, which is not "
             "supported. Declare a disturbance of the output instead (disturbance_model), or Parameter(..., "

@@ -19,7 +19,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.estimate.switching import Filter
-from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, shown_parameters
 from hybrid_mpc.identify.varying import WORTH, Varying
 from hybrid_mpc.model.model import HybridModel
 
@@ -170,7 +170,8 @@ def choose_tracked(
     Candidates are the parameters whose own variation between recordings has evidence
     (:func:`~hybrid_mpc.identify.varying.find_varying`). They enter one after the other, the best first, as long as the
     error falls by 3 % and no output's rises by 2 %, in each set of evidence. All varying parameters together, and all
-    candidates together, are tried, too. A parameter that the user declares as varying is always tracked.
+    candidates together, are tried, too. A parameter that the user declares as varying is always tracked. Parameters in
+    the output equation are no candidates.
 
     Two sets are needed, since either flatters. A prior that was fitted to the very recordings is closer to them than to
     new ones, so tracking has less to gain. A prior that was fitted to fewer recordings is worse than the one that is
@@ -187,7 +188,8 @@ def choose_tracked(
         [(o, [own[i].part(slice(WATCHED)) for i in evenly(len(own), RECORDINGS)]) for o, own in one]
         for one in watched
     ]
-    names = [s.name for s in watched[0][0][0].model.outputs]
+    model = watched[0][0][0].model
+    names, shown = [s.name for s in model.outputs], shown_parameters(model)
 
     def errors(
         evidence: Sequence[tuple[Filter, Sequence[Trajectory]]], chosen: Sequence[TrackedParameter]
@@ -226,9 +228,9 @@ def choose_tracked(
     pool = {
         p.name: p.tracked(p.alone)
         for p in varying.parameters
-        if not p.declared and p.alone > 0 and p.gain >= WORTH
+        if not p.declared and p.alone > 0 and p.gain >= WORTH and p.name not in shown
     }
-    varies = tuple(p.tracked() for p in varying.parameters if p.varies)
+    varies = tuple(p.tracked() for p in varying.parameters if p.varies and p.name not in shown)
     together = [varies, (*best, *pool.values())]
     while True:
         have = {one.name for one in best}

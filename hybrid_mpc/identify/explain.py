@@ -77,7 +77,8 @@ GAIN = 0.7
 with a large reduction does not widen the interval."""
 POOR = 0.7
 """Error [spreads] of a model that explains half of the outputs' variance. If the error with a term is larger, only a
-ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance."""
+ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance. The same holds where all
+evidence is one recording: its blocks do not show what differs in the next."""
 DOUBT = 0.1
 """Probability that the ratio lies beyond one end of its interval, for all fitted candidates of a step together. A term
 is added if the upper end is below 1."""
@@ -805,6 +806,11 @@ class _Explain:
             reason = f"the ratio to the model without it is {found.ratio:.2f} ({bound(found.upper)}): not significant"
             if more:
                 reason += f", {more} more recording{'s' * (more > 1)} like these would show it"
+        elif self.evidence.told.recordings == 1 and found.ratio > GAIN:
+            reason = (
+                f"the ratio to the model without it is {found.ratio:.2f}: blocks of one recording do not show whether "
+                "so small a gain holds in another one, record a second one"
+            )
         elif found.error > POOR and found.ratio > GAIN:
             reason = f"the error is {found.error:.2f} of the outputs' spread with it: so small a gain may be chance"
         elif untold:
@@ -831,7 +837,10 @@ class _Explain:
         terms = (*self.now.terms, *pair.forms)
         for form in pair.forms:
             kept, theta = self.search.without(terms, pair.theta, form)
-            alone = self.search.held_out(kept, theta)
+            try:
+                alone = self.search.held_out(kept, theta)
+            except (InputError, np.linalg.LinAlgError):
+                continue  # without this term the model cannot be simulated in every fold
             if self.evidence.compared(pair.squares, alone, 1).ratio >= WORTH:
                 return False
         return True
@@ -872,8 +881,11 @@ class _Explain:
                 if term.name in newest:
                     continue
                 kept, theta = self.search.without(self.now.terms, self.now.theta, term)
-                fitted = self.search.begun(kept, theta)
-                squares = self.search.held_out(kept, fitted.theta)
+                try:
+                    fitted = self.search.begun(kept, theta)
+                    squares = self.search.held_out(kept, fitted.theta)
+                except (InputError, np.linalg.LinAlgError):
+                    continue  # without this term the model cannot be simulated in every fold
                 found = self.evidence.compared(squares, self.now.squares, 1)
                 if least is None or found.ratio < least[0].ratio:
                     least = found, term, _State(kept, fitted.theta, squares)

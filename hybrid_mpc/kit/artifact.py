@@ -19,7 +19,7 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter
-from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, with_tracked
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, tracked_range, with_tracked
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.kit.assembly import (
     make_adaptive_guard,
@@ -56,13 +56,14 @@ from hybrid_mpc.kit.parts import (
 from hybrid_mpc.kit.prediction import Predicting
 from hybrid_mpc.kit.promises import Promise, PromiseTable, none_made, read_promises
 from hybrid_mpc.loop.guard import Guard
+from hybrid_mpc.model.blend import BLEND_SHARE, blended, with_share
 from hybrid_mpc.model.delay import with_input_delay
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.limits import check_flag
 from hybrid_mpc.model.model import STEP_INPUTS, STEP_OUTPUTS, Balance, HybridModel, kinematics
 from hybrid_mpc.records import known, plain
 from hybrid_mpc.scenario import Scenario
-from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.detector import ChannelLimit, WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
 from hybrid_mpc.watch.lengths import SHARE
 from hybrid_mpc.watch.monitor import Monitor, make_monitor, reads_energy
@@ -75,6 +76,10 @@ INPUTS = {
     "output": ("x", "u", "w", "p"),
     BALANCE: ("x", "xdot", "u", "w", "p"),
 }
+RELEASED = 0.9
+"""Share of a tracked parameter's limit at which its alarm ends."""
+ALMOST_PRIOR = 0.1
+"""Share of the correction with which a blend starts if the prior is recommended."""
 OWN = ("step", "xdot")
 """Functions that each single network has of its own; the others are those of the hybrid."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
@@ -280,6 +285,22 @@ def _disturbed(
     """A model with the chosen disturbance model; the same object if it already has it."""
     model = models[name]
     return model if model.disturbance_model == chosen else replace(model, disturbance_model=chosen)
+
+
+def drift_limits(model: HybridModel, tracked: Sequence[TrackedParameter]) -> tuple[ChannelLimit, ...]:
+    """Limits of a model's tracked parameters: their distance from the fitted value at three standard deviations.
+
+    A parameter that drifts as it did between the recordings stays within them; beyond, the machine is another one, or
+    has a fault.
+    """
+    parameters = {p.name: p for p in model.parameters}
+    found = []
+    for one, low, high in zip(tracked, *tracked_range(model, tracked), strict=True):
+        p = parameters[one.name]
+        far = max(high - p.value, p.value - low)
+        if far > 0:
+            found.append(ChannelLimit(p.name, p.unit, 1, far, RELEASED * far))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -529,6 +550,34 @@ class Kit:
         """A kit whose :meth:`tracking_observer` tracks these parameters."""
         return replace(self, loop=replace(self.loop, tracked=tuple(tracked)))
 
+    def blended(self, share: float | None = None, std: float = 0.3) -> Kit:
+        """A kit whose tracking observer runs prior and hybrid side by side and estimates the share of the correction.
+
+        Its hybrid is ``prior + share (hybrid - prior)`` (:func:`~hybrid_mpc.model.blend.blended`); the share, from 0 to
+        2, is one more tracked parameter. Where the machine has changed since the recordings, the correction may no
+        longer fit: the loop then uses less of it, or more.
+
+        Args:
+            share: Share that the observer starts with. Default: 1, the hybrid, if it is recommended; else 0.1, almost
+                the prior. At 0 it could not move.
+            std: Standard deviation of the share. Default: 0.3, so that prior and hybrid are three deviations apart.
+
+        Raises:
+            InputError: If the kit has no hybrid, or the share is not inside 0 to 2.
+
+        Example:
+            ``kit = hm.load("runs/mine").blended()``;
+            ``loop = hm.Loop(kit.tracking_observer("hybrid"), kit.controller("hybrid", tracking=True))``
+        """
+        prior, hybrid = self._model("prior"), self._model("hybrid")
+        if share is None:
+            share = 1.0 if self.recommended == "hybrid" else ALMOST_PRIOR
+        if not 0.0 < share < BLEND_SHARE.upper:
+            raise InputError(f"share: must be between 0 and {BLEND_SHARE.upper:g}, got {share} [HM-KIT-041]")
+        models = {"prior": with_share(prior, share), "hybrid": blended(prior, hybrid, share)}
+        tracked = (*self.loop.tracked, TrackedParameter(BLEND_SHARE.name, std))
+        return replace(self, models={**self.models, **models}).with_tracked(tracked)
+
     def _tracked(self) -> tuple[TrackedParameter, ...]:
         if not self.loop.tracked:
             raise InputError(
@@ -565,7 +614,7 @@ class Kit:
             *models, self.problem(task), solver=solver, iterations=iterations, safe_input=self.safe_input
         )
 
-    def monitor(self, model: str = "", *, kind: str = "", task: str = "") -> Monitor:
+    def monitor(self, model: str = "", *, kind: str = "", task: str = "", tracking: bool = False) -> Monitor:
         """The monitor of a loop or a recording, with the limits learned by the run.
 
         A mechanical model with measured positions is monitored by its energy, any other model by the residuals of its
@@ -577,15 +626,26 @@ class Kit:
                 with their limits; ``"own"``: the suitable readings without limits, so that it only alarms without a
                 valid reading. Default: ``"guard"``.
             task: Task whose control problem gives the inputs' ranges. Default: the common control problem.
+            tracking: For a loop with :meth:`tracking_observer`: readings use the tracked parameters, so that their
+                drift raises no alarm, and a parameter beyond three standard deviations does, by its name. The kind
+                ``"guard"`` then means residuals. Default: False.
 
         Raises:
-            InputError: If model, task or kind are unknown, limits are missing (all kinds but ``"own"``), or
-                ``"energy"`` is requested for a model without energy balance.
+            InputError: If model, task or kind are unknown, limits are missing (all kinds but ``"own"``),
+                ``"energy"`` is requested for a model without energy balance, or ``tracking`` is requested and the kit
+                names no tracked parameters.
         """
         watched = self._model(model)
         kind = known(_named(kind, "kind of monitor") or "guard", WATCHES, "kind of monitor")
         of = kind if kind in (ENERGY, RESIDUALS) else ""
+        check_flag(tracking, "tracking")
+        of = of or RESIDUALS if tracking else of
         limits = None if kind == "own" else self.limits(model, of)
+        if tracking:
+            watched = with_tracked(watched, self._tracked())
+            if limits is not None and limits.kind == RESIDUALS:
+                beyond = drift_limits(self._model(model), self._tracked())
+                limits = replace(limits, channels=(*limits.channels, *beyond))
         span = self.problem(task).input_range if self.loop.control or task else None
         rest = self.known_rest if limits is None else None
         return make_monitor(watched, limits, kind=of, rest_speed=rest, input_range=span)

@@ -31,8 +31,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
-from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held
-from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
+from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held, n_tracked, with_unknown
+from hybrid_mpc.model.limits import check_function, check_part, floats, sampled, whole
 from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
@@ -133,8 +133,8 @@ class Loop:
             set-point ``(n_x,)`` or ``(n_y,)``. Default: the operating point.
         weight: Factors on ``q``, ``t (n,) -> (n, n_x)``. Default: 1.
         guard: Reaction to alarms of the monitor, which it needs. Default: none.
-        w: Forecast of the measured disturbances, ``t (n,) [s] -> (n, n_w)``, for a problem that previews them. Default:
-            none; the last measured values are held.
+        w: Forecast of the measured disturbances, ``t (n,) [s] -> (n, n_measured)``, for a problem that previews them.
+            Default: none; the last measured values are held.
         end: Time [s] beyond which non-finite previews hold their last value. Default: never.
         input_delay: Periods after which an input acts, as in the estimator; shifts the preview. Default: 0.
         sensor_delay: Periods after which a measurement arrives; the monitor uses it to pair measurement and input.
@@ -196,7 +196,8 @@ class Loop:
         self._delay = whole_periods(input_delay, "input_delay")
         self._n_inputs = self._delay + whole_periods(sensor_delay, "sensor_delay") + 1
         self._previews = Previews(reference, weight, self.ocp, self.model.dt, end, self.standing)
-        self._forecast = Forecast(w, self.ocp, self.model.n_w, self.model.dt)
+        self._tracked = n_tracked(estimator)
+        self._forecast = Forecast(w, self.ocp, self.n_measured, self.model.dt, self._tracked)
         self._truth, self._now = sees_truth(estimator), now
         self._state: LoopState | None = None
         self._decide_late: Callable[[], tuple[Decision, GuardState]] | None = None
@@ -207,6 +208,11 @@ class Loop:
         """Reference ``(m, n_x)`` and factors on ``q`` (None for 1) of this period's decision."""
         self.spent = dict.fromkeys(TIMED, 0.0)
         """Durations [s] of this period, by the names of ``TIMED``."""
+
+    @property
+    def n_measured(self) -> int:
+        """Number of measured disturbances, without the parameters that the estimator tracks."""
+        return self.model.n_w - self._tracked
 
     def start(
         self,
@@ -455,12 +461,17 @@ class Loop:
         """Measured disturbances ``(m, n_w)``, a row for the present and each known period; None if not measured."""
         if w is None:
             return None
-        rows = sampled(w, (None, self.model.n_w), "w, the measured disturbances and their forecast,")
+        name, n_w = "w, the measured disturbances and their forecast,", self.model.n_w
+        given: ArrayLike = w
+        if self._tracked:
+            given = floats(w, name)
+            n_w = n_w if given.shape[-1:] == (n_w,) else self.n_measured
+        rows = sampled(given, (None, n_w), name)
         if not len(rows):
             raise InputError(
                 "w: no rows; give the measured disturbances, or a row for each period ahead [HM-LOOP-022]"
             )
-        return rows
+        return rows if n_w == self.model.n_w else with_unknown(rows, self._tracked)
 
     def _select_measured(self, measured: Array | None) -> dict[str, Array]:
         """Keyword argument ``w`` of the estimator; empty if the model has no measured disturbances."""

@@ -67,24 +67,37 @@ class Forecast:
         ocp: The problem.
         n_w: Number of measured disturbances.
         dt: Period [s].
+        unknown: Number of columns of NaN to append, one for each tracked parameter. Default: 0.
 
     Raises:
         InputError: If there is a forecast, but no measured disturbance.
     """
 
-    def __init__(self, w: Preview | None, ocp: OCP, n_w: int, dt: float) -> None:
+    def __init__(self, w: Preview | None, ocp: OCP, n_w: int, dt: float, unknown: int = 0) -> None:
         if w is not None and not n_w:
             raise InputError("w: the model has no measured disturbances to forecast; remove w [HM-LOOP-032]")
         if w is not None:
             check_function(w, "w")
         self._w = w if ocp.preview_w else None
-        self._n_w, self._ahead = n_w, np.arange(ocp.horizon, dtype=np.float64) * dt
+        self._n_w, self._unknown, self._ahead = n_w, unknown, np.arange(ocp.horizon, dtype=np.float64) * dt
 
     def __call__(self, t: float) -> Array | None:
         """Disturbances from ``t`` on; None: the last measured values are held."""
         if self._w is None:
             return None
-        return sampled(self._w(t + self._ahead), (self._ahead.size, self._n_w), "what w returns")
+        return with_unknown(
+            sampled(self._w(t + self._ahead), (self._ahead.size, self._n_w), "what w returns"), self._unknown
+        )
+
+
+def n_tracked(estimator: object) -> int:
+    """Number of parameters that an estimator tracks: its model has them as the last measured disturbances."""
+    return len(getattr(estimator, "tracked", ()))
+
+
+def with_unknown(w: Array, n: int) -> Array:
+    """Measured disturbances ``(m, n_w)`` with ``n`` further columns of NaN: values that only the estimator knows."""
+    return np.hstack([w, np.full((len(w), n), np.nan)]) if n else w
 
 
 def held(values: Array, first: Array) -> Array:

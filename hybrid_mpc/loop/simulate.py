@@ -22,7 +22,7 @@ from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
 from hybrid_mpc.loop.plant import Plant, SimulatedMachine
-from hybrid_mpc.loop.preview import Preview, Previews
+from hybrid_mpc.loop.preview import Preview, Previews, n_tracked
 from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.limits import check_function, check_part, sampled, vector, whole
 from hybrid_mpc.model.model import HybridModel
@@ -135,12 +135,13 @@ def simulate(
         whole_periods(sensor_delay, "sensor_delay"),
         whole_periods(input_delay, "input_delay"),
     )
+    n_w = estimator.model.n_w - n_tracked(estimator)
+    surroundings = _make_disturbances(w, estimator.model, n_w)
     loop = Loop(
         estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
-        w=_make_disturbances(w, estimator.model), end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
+        w=surroundings, end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
         sensor_delay=sensor_delay, now=now,
     )  # fmt: skip
-    surroundings = _make_disturbances(w, estimator.model)
     ocp, model, periods = loop.ocp, loop.model, round(duration / dt)
     plant, faults = install(plant, faults)
     outputs, inputs = (tuple(s.name for s in signals) for signals in (model.outputs, model.inputs))
@@ -168,25 +169,26 @@ def simulate(
         y = machine.measure(t)
         truth = np.concatenate([x, plant.hidden(machine.state)])
         in_time = None if late is None else partial(_in_time, late, t)
-        now_w = np.zeros(0) if surroundings is None else _row_at(surroundings, t, model.n_w)
+        now_w = np.zeros(0) if surroundings is None else _row_at(surroundings, t, n_w)
         if k == 0:
             loop.start(y, now_w, truth=truth, in_time=in_time)
             machine.rest(loop.state.inputs[0])
         else:
             loop.step(y, now_w, truth=truth, in_time=in_time)
+        known_w = np.append(now_w, loop.estimate.w[n_w:]) if model.n_w else now_w
         u, u_prev = machine.command(loop.decision.u)
         loop.finish()
         reference_now, factors = loop.previewed if acting is None else acting(t)
         goal = _goal(ocp, model, reference_now[0], loop.decision.solution.steady)
         with np.errstate(over="ignore", invalid="ignore"):  # a huge reference has an infinite cost
             weights = 1.0 if factors is None else factors[0]
-            error = model.output(x, u, now_w, model.p).full().ravel() - goal.y if cost.n_y else None
+            error = model.output(x, u, known_w, model.p).full().ravel() - goal.y if cost.n_y else None
             stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, weights, u_ref=goal.u, y_error=error))
         step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
-        rows.append(_row(step, goal, now_w, stage, loop.spent))
+        rows.append(_row(step, goal, known_w, stage, loop.spent))
         if on_step is not None:
             on_step(step)
-        machine.advance(t, now_w if model.n_w else None)
+        machine.advance(t, now_w if n_w else None)
     return _build_result(rows, dt, loop.switches)
 
 
@@ -195,20 +197,20 @@ def _list_items(faults: object) -> Sequence[object]:
     return faults if isinstance(faults, list | tuple) else (faults,)
 
 
-def _make_disturbances(w: Preview | ArrayLike | None, model: HybridModel) -> Preview | None:
-    """Measured disturbances as a function of time; None if the model has none.
+def _make_disturbances(w: Preview | ArrayLike | None, model: HybridModel, n_w: int) -> Preview | None:
+    """The first ``n_w`` disturbances, those measured, as a function of time; None if there are none.
 
     Raises:
         InputError: If the number of constant disturbances is wrong, or the model has none.
     """
-    if not model.n_w and w is not None:
+    if not n_w and w is not None:
         raise InputError(f"w: model {model.name} has no measured disturbances; remove w [HM-LOOP-045]")
-    if not model.n_w:
+    if not n_w:
         return None
     if callable(w):
         check_function(w, "w")
         return w
-    constant = model.w if w is None else vector(w, model.n_w, "w")
+    constant = model.w[:n_w] if w is None else vector(w, n_w, "w")
     return lambda t: np.tile(constant, (len(t), 1))
 
 
@@ -376,7 +378,8 @@ class ClosedLoopResult:
         innovation: Innovations of the estimator ``(n, n_y)`` [output units]; NaN without a measurement. Default:
             unknown.
         nis: Normalised innovations squared ``(n,)`` [-]; NaN without a measurement. Default: unknown.
-        w: Measured disturbances ``(n, n_w)`` that act from ``t_k`` on. Default: none.
+        w: Measured disturbances ``(n, n_w)`` that act from ``t_k`` on, and estimates of tracked parameters as the last
+            columns. Default: none.
         y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN if the reference is one of states. Default:
             unknown.
         reached: ``(n,)``, False if the set-point cannot be reached. Default: unknown.

@@ -258,6 +258,9 @@ CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = {
     "prior_observer": (name_of("prior_observer"), "prior", "s", False),
     "hybrid": (name_of("hybrid"), "hybrid", "o", True),
     "hybrid_observer": (name_of("hybrid_observer"), "hybrid", "s", False),
+    "prior_tracking": (name_of("prior_tracking"), "prior_tracking", "s", False),
+    "hybrid_tracking": (name_of("hybrid_tracking"), "hybrid_tracking", "s", False),
+    "blended_observer": (name_of("blended_observer"), "blended_observer", "s", False),
     "oracle": ("oracle, measuring", "oracle", "D", True),
     "oracle_state": (name_of("oracle_state"), "oracle", "D", False),
 }

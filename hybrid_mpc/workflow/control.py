@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.compare.controllers import CONTROLLERS
+from hybrid_mpc.compare.controllers import CONTROLLERS, noise_name
 from hybrid_mpc.compare.loops import (
     DRAWN,
     ON_MODEL,
@@ -150,7 +150,7 @@ def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[Loop
     """Results of finished loops."""
     kit = bench.kits[next(iter(study.folders))]
     (faults,) = study.fault_sets
-    filters = [name for name in study.controllers if not CONTROLLERS[name].truth]
+    filters = dict.fromkeys(noise_name(name) for name in study.controllers if not CONTROLLERS[name].truth)
     return ControlResults(
         schema="hybrid-mpc control",
         schema_version=SCHEMA_VERSION,

@@ -161,7 +161,7 @@ def check_choice(only: Sequence[str], skip: Sequence[str]) -> None:
     needed = [name for name in skip if name not in optional]
     if needed:
         raise InputError(
-            f"--skip {needed[0]}: a model needs this stage. Stages that can be skipped: {', '.join(optional)}"
+            f"--skip {needed[0]}: a run needs this stage. Stages that can be skipped: {', '.join(optional)}"
             " [HM-WORKFLOW-031]"
         )
 

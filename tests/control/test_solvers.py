@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from control_parts import POINT, estimate_of, linear_problem, pendulum_problem, plan_of
-from online_models import pendulum_model, random_linear
+from online_models import pendulum_model, random_linear, runaway
 
 from hybrid_mpc import (
     OCP,
@@ -232,3 +232,12 @@ def test_a_rivals_plan_is_a_start():
 def test_bad_options_are_refused(use, words):
     with pytest.raises(InputError, match=words):
         use(pendulum_model(), pendulum_problem(10))
+
+
+@pytest.mark.parametrize("solver", [CondensedController, *SOLVERS])
+@pytest.mark.parametrize(("bound", "fine"), [(1.0, False), (1e3, True), (np.inf, True)])
+def test_a_plan_far_outside_of_a_declared_range_is_not_applied(solver, bound, fine):
+    model, ocp = runaway(bound), OCP(20, [1.0], [1.0], [0.0], [-0.1], [0.1])
+    got = plan_of(solver(model, ocp), estimate_of(model, [0.9], 0.0), np.zeros((1, 1)))
+    assert got.status.ok is fine
+    assert (got.status is Status.DIVERGED) is not fine

@@ -223,7 +223,7 @@ def replay(whole, case, *, own=False, told=True, known=None):
     )  # fmt: skip
 
 
-STATUSES = ("INITIAL", "SOLVED", "NOT_FINITE", "INFEASIBLE", "INACCURATE")
+STATUSES = ("INITIAL", "SOLVED", "NOT_FINITE", "INFEASIBLE", "INACCURATE", "DIVERGED")
 
 
 def freezes(start, end=np.inf, channel=""):

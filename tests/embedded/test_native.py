@@ -17,6 +17,7 @@ from hybrid_mpc import (
     Limits,
     Loop,
     SafeController,
+    Status,
     SwitchingFilter,
     TrueState,
 )
@@ -25,6 +26,7 @@ from hybrid_mpc.embedded.native import NativeController
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
 from golden_parts import frozen_estimates, machine, previews
+from online_models import runaway
 
 pytestmark = needs_compiler
 TOLERANCE = 1e-9
@@ -111,6 +113,16 @@ def test_small_machines_with_everything(name):
         assert (found.steady is None) == (not ocp.n_y)
     assert seen["limit"] > 5
     assert seen["soft"] > 3 or name == "delayed"
+
+
+def test_a_plan_far_outside_of_a_declared_range_is_refused_in_c():
+    model, ocp = runaway(1.0), OCP(20, [1.0], [1.0], [0.0], [-0.1], [0.1])
+    python, native = CondensedController(model, ocp), NativeController(model, ocp, flags=parts.QUICK)
+    for start, status in ((0.9, Status.DIVERGED), (0.19, Status.SOLVED)):
+        e = TrueState(model).start(np.array([start]))
+        plans = [c.solve(c.initial(e), e, np.zeros((1, 1))) for c in (python, native)]
+        assert [p.status for p in plans] == [status, status]
+        np.testing.assert_allclose(plans[1].u, plans[0].u, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -18,7 +19,7 @@ from hybrid_mpc import (
     fit_prior,
 )
 from hybrid_mpc.identify import term_table
-from hybrid_mpc.identify.explain import explain
+from hybrid_mpc.identify.explain import _Explain, explain
 from hybrid_mpc.identify.explanation import Explanation
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import visited
@@ -222,6 +223,17 @@ def test_a_candidate_whose_fit_diverges_is_reported_and_the_search_goes_on():
     )  # fmt: skip
     assert [term.name for term in found.found] == ["dry"]
     assert [trial.name for trial in found.diverged] == ["wild"]
+
+
+@pytest.mark.parametrize("failure", [InputError("too stiff"), np.linalg.LinAlgError("singular")])
+def test_a_pair_is_needed_where_the_model_without_a_term_cannot_be_simulated(failure):
+    def fail(terms, theta):
+        raise failure
+
+    search = SimpleNamespace(without=lambda terms, theta, form: (terms, theta), held_out=fail)
+    own = SimpleNamespace(search=search, now=SimpleNamespace(terms=()))
+    pair = SimpleNamespace(sure=True, forms=("one", "other"), theta=np.zeros(2))
+    assert _Explain._both_needed(own, pair)
 
 
 def test_an_own_term_may_have_parameters_that_are_not_zero():

@@ -127,8 +127,8 @@ def test_recordings_that_are_too_short_are_refused():
         find_varying(Heater, fit, short, dt=DT, length=4.0)
 
 
-def observer(fit):
-    prior = Heater(fit.values)
+def observer(fit, make=Heater):
+    prior = make(fit.values)
     programs = {f"prior/{name}": p for name, p in prior_programs(prior, DT).items()}
     model = build_model("prior", programs, model_info(prior, DT))
     return ExtendedKalmanFilter(
@@ -180,3 +180,25 @@ def test_tracked_entries_carry_the_scale():
     gain = found.parameters[0]
     assert gain.tracked() == TrackedParameter("gain", gain.std / gain.value, True)
     assert found.rows()[0]["varies"] is True
+
+
+class Scaled(Heater):
+    """The sensor's scale differs between the recordings instead of the gain."""
+
+    parameters = (*Heater.parameters[1:], Parameter("scale", 2.0, "-", 0.2, 10.0))
+
+    def xdot(self, x, u, w, p):
+        return ((u.power + p.bias - x.heat) / p.tau,)
+
+    def output(self, x, u, w, p):
+        return (p.scale * x.heat,)
+
+
+def test_a_parameter_of_the_sensor_varies_but_is_no_candidate():
+    recordings = recorded(GAINS[:6])
+    fit, found = varying_of(Scaled, recordings)
+    assert {p.name: p.varies for p in found.parameters}["scale"]
+    chosen = choose_tracked([[(observer(fit, Scaled), recordings)]], found, 2.0)
+    assert "scale" not in {one.name for one in chosen.tracked} | {
+        name for names in chosen.tried for name in names.split(", ")
+    }

@@ -41,7 +41,8 @@ typedef enum {
   HMPC_SOLVED,     /* the QP was solved and its solution checked */
   HMPC_NOT_FINITE, /* estimate, reference, model or plan hold a value that is not finite */
   HMPC_INFEASIBLE, /* the solution violates an input limit or the limit of an input change */
-  HMPC_INACCURATE  /* the solution fails the KKT check, or the iteration limit was reached */
+  HMPC_INACCURATE, /* the solution fails the KKT check, or the iteration limit was reached */
+  HMPC_DIVERGED    /* the plan leaves the declared range of a state by more than ten times its width */
 } hmpc_status;
 
 typedef enum {

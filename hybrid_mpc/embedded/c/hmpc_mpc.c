@@ -444,17 +444,21 @@ static real input_goal(const real *u_goal, int period, int input) {
   return u_goal ? u_goal[period * HMPC_NU + input] : u_rest[input];
 }
 
-/* Cost of the prepared plan with the step qp.step, and its largest violations of soft and of hard bounds. */
-static void assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int rows, const real *u_goal) {
+/* Cost of the prepared plan with the step qp.step, and its largest violations of soft and of hard bounds. 0 if its
+   states diverge: x_reach holds ten widths beyond their declared ranges. */
+static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int rows, const real *u_goal) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
   real total = R(0.0), error[HMPC_NX], before[HMPC_NU];
+  int near = 1;
   memcpy(before, linear->u_prev, sizeof before);
   for (int k = 0; k <= HMPC_N; ++k) {
     const int m = k > 0 ? (block_of[k - 1] + 1) * HMPC_NU : 0;
     const real *const goal = row_of(x_goal, rows, k, HMPC_NX);
     for (int i = 0; i < HMPC_NX; ++i)
       error[i] = linear->z[k][i] + s->dz[k][i] + hmpc_dot(linear->from_u[k][i], step, m) - goal[i];
+    for (int i = 0; i < HMPC_NX && k > 0; ++i)
+      near = near && error[i] + goal[i] >= x_reach[0][i] && error[i] + goal[i] <= x_reach[1][i];
     if (k == HMPC_N) break;
 #if HMPC_STAGE_COST
     real x[HMPC_NX], acts[HMPC_NU], cost;
@@ -520,6 +524,7 @@ static void assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, in
 #endif
   s->plan.cost = total;
   s->plan.excess = excess;
+  return near;
 }
 
 /* Keeps the prepared plan if there is no valid solution. */
@@ -638,7 +643,8 @@ static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows
   return fine;
 }
 
-hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows) {
+/* Solves the prepared plan for the estimate and the goal; near: 0 if its states diverge. */
+static hmpc_status solve_plan(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows, int *near) {
   const hmpc_linear *const linear = &s->linear;
   const hmpc_qp *const qp = &s->qp;
   drawn_to to;
@@ -646,7 +652,7 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
   if (!embed(s, goal, w, w_rows, &to)) return failed(s, HMPC_NOT_FINITE);
   const hmpc_status status = hmpc_qp_solve(&s->qp, &s->working, linear);
   if (status != HMPC_SOLVED) return failed(s, status);
-  assess(s, goal, to.x, to.rows, to.u);
+  *near = assess(s, goal, to.x, to.rows, to.u);
   if (!hmpc_finite(s->plan.cost)) return failed(s, HMPC_NOT_FINITE);
   for (int k = 0; k < HMPC_N; ++k) {
     real low[HMPC_NU], high[HMPC_NU];
@@ -661,6 +667,12 @@ hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, i
 #endif
   s->pending = 1;
   return s->status = HMPC_SOLVED;
+}
+
+hmpc_status hmpc_feedback(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows) {
+  int near = 1;
+  const hmpc_status status = solve_plan(s, goal, w, w_rows, &near);
+  return status == HMPC_SOLVED && !near ? failed(s, HMPC_DIVERGED) : status;
 }
 
 /* ---- safeguards */
@@ -818,11 +830,12 @@ void hmpc_take_over(hmpc_state *s, const real *plan, const real *held) {
 
 /* Iterations of a first plan, which has no previous plan, from the inputs u with the last row held; 0 if one failed. */
 static int iterate(hmpc_state *s, const hmpc_goal *goal, const real *u, int rows) {
+  int near;
   s->working.count = 0;
   hmpc_run_free(s, u, rows);
   for (int i = 1; i < HMPC_FIRST; ++i) {
     delay_plan(s, s->u);
-    if (hmpc_feedback(s, goal, (const real *)0, 0) != HMPC_SOLVED) return 0;
+    if (solve_plan(s, goal, (const real *)0, 0, &near) != HMPC_SOLVED) return 0;
     hmpc_complete(s);
   }
   return 1;

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.compare.controllers import CONTROLLERS, OBSERVERS, ORACLES
+from hybrid_mpc.compare.controllers import COMPARED, OBSERVERS, ORACLES
 from hybrid_mpc.compare.loops import (
     DRAWN,
     MODEL,
@@ -93,7 +93,7 @@ def parts_of(scenario: Scenario, tasks: Sequence[Task], budget: Budget, seeds: r
     First come the timed ones, then the slow ones.
     """
     parts = [Part(task, name, (0,), timed=True) for task in tasks for name in TIMED if 0 in seeds]
-    for name in reversed(list(CONTROLLERS)):
+    for name in reversed(COMPARED):
         most = _seeds(name, scenario, budget.seeds, budget.oracle_seeds)
         own = range(max(seeds.start, 1 if name in TIMED else 0), min(seeds.stop, most))
         together = 1 if name in ORACLES else max(1, len(own))
