@@ -171,7 +171,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         self.huber, self.jump = (
             float(numbers([value], name)[0]) for name, value in (("huber", huber), ("jump", jump))
         )
-        if not min(self.huber, self.jump) > 0:
+        if not (self.huber > 0 and self.jump > 0):
             raise InputError(f"huber, jump: must be positive, got {huber} and {jump} [HM-ESTIMATE-028]")
         self.lower, self.upper = _bounds(model, lower, upper)
         self._sigma_y = np.sqrt(self._noise_y)

@@ -50,12 +50,12 @@ def tanks(lower=0.0):
 
 
 def emptied(model, n, seed=0, load=0.0):
-    """Outputs and inputs while the tanks run empty, with noise of 0.02, and from the tenth period on an inflow."""
+    """Outputs and inputs while the tanks run empty, with noise of 0.02, and from the ninth period on an inflow."""
     rng, x, ys = np.random.default_rng(seed), np.array([0.2, 0.15]), []
     us = np.where(np.arange(n) < 0.8 * n, 0.0, 0.2)[:, None]
     for k, u in enumerate(us):
         ys.append(x[1:] + 0.02 * rng.normal(size=1))
-        x = np.maximum(model.step(x, [], u + load * (k >= 10), model.w, model.p)[0].full().ravel(), 0.0)
+        x = np.maximum(model.step(x, [], u + load * (k >= 8), model.w, model.p)[0].full().ravel(), 0.0)
     return np.array(ys), us
 
 
@@ -103,7 +103,7 @@ def solved_by_ipopt(mhe, e, first):
     options = {
         "print_time": False,
         "ipopt.print_level": 0,
-        "ipopt.tol": 1e-12,
+        "ipopt.tol": 1e-10,
         "ipopt.bound_relax_factor": 0.0,
     }
     solver = ca.nlpsol("mhe", "ipopt", {"x": v, "f": cost}, options)
@@ -116,16 +116,17 @@ def solved_by_ipopt(mhe, e, first):
     return found.full().ravel()[: (m + 1) * n].reshape(m + 1, n)
 
 
-@pytest.mark.parametrize(("seed", "load"), [(0, 0.0), (1, 0.0), (0, 0.5)])
+@pytest.mark.parametrize(("seed", "load"), [(0, 0.0), (1, 0.0), (0, 1.5)])
 def test_converged_it_is_the_solution_of_ipopt_with_bounds_outliers_and_jumps(seed, load):
     model = tanks()
     ys, us = emptied(model, 19, seed, load)
     ys[5] += 1.0  # 50 standard deviations
-    mhe = MovingHorizonEstimator(model, **TANK, periods=20, iterations=200)
+    noise = {**TANK, "sigma_x": [2e-3, 2e-3], "sigma_d": [0.1], "sigma_d0": [0.01]} if load else TANK
+    mhe = MovingHorizonEstimator(model, **noise, periods=20, iterations=200, jump=1.0)
     e = mhe.run(ys, us)[-1]
     want = solved_by_ipopt(mhe, e, e.first)
     if load:  # a jump has the linear loss
-        assert np.max(np.abs(np.diff(want[:, 2]))) > 1.1 * mhe.jump * TANK["sigma_d"][0]
+        assert np.max(np.abs(np.diff(want[:, 2]))) > 1.1 * mhe.jump * 0.1
     else:  # a bound is active
         assert np.any(want[:, :2] < 1e-7)
     np.testing.assert_allclose(e.z, want, rtol=0, atol=1e-6)
@@ -240,15 +241,16 @@ def test_rubbish_raises_nothing(n):
 
 
 def test_a_jump_of_the_load_is_found_sooner_than_by_the_kalman_filter():
-    model, errors = pendulum_model(), {}
+    a, b = np.array([[1.0, 0.1], [0.0, 0.95]]), np.array([[0.005], [0.1]])
+    model, errors = linear_model(a, b, np.array([[1.0, 0.0]])), {}
     for kind in (ExtendedKalmanFilter, MovingHorizonEstimator):
-        filter = kind(model, **{**PENDULUM, "sigma_d": [1e-3], "sigma_d0": [1e-3]})
+        filter = kind(model, **sigmas(model, sigma_y=[0.01], sigma_x=[1e-3, 1e-3], sigma_d=[0.02]))
         rng, x, e = np.random.default_rng(0), np.zeros(2), filter.start([0.0])
-        for k in range(80):
-            x = model.step(x, [], [0.1 * (k >= 40)], model.w, model.p)[0].full().ravel()
-            e = filter.update(e, x[:1] + 1e-3 * rng.normal(size=1), [0.0])
-        errors[kind] = abs(e.d[0] - 0.1)
-    assert errors[MovingHorizonEstimator] < 0.5 * errors[ExtendedKalmanFilter]
+        for k in range(55):
+            x = a @ x + b[:, 0] * 2.0 * (k >= 40)
+            e = filter.update(e, x[:1] + 0.01 * rng.normal(size=1), [0.0])
+        errors[kind] = abs(e.d[0] - 2.0)
+    assert errors[MovingHorizonEstimator] < 0.5 * errors[ExtendedKalmanFilter], errors
 
 
 def test_a_constant_load_leaves_no_offset():
