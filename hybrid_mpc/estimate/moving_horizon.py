@@ -2,25 +2,27 @@
 
 Over a window of ``m`` periods the estimate is the trajectory ``z_0 .. z_m`` of ``z = (x, h, d)`` that minimizes::
 
-    1/2 |z_0 - first|^2_{P_0^-1}  +  1/2 sum |z_{k+1} - f(z_k, u_k)|^2_{Q^-1}  +  sum rho((y_k - g(z_k, u_k)) / sigma)
+    1/2 |z_0 - first|^2_{P_0^-1}  +  sum rho_w(Q^-1/2 (z_{k+1} - f(z_k, u_k)))  +  sum rho((y_k - g(z_k, u_k)) / sigma)
 
-subject to ``lower <= x_k <= upper``; ``rho`` is Huber's loss, ``e^2 / 2`` up to ``huber`` and linear beyond. Where a
-component has neither initial variance nor noise it is an equality constraint.
+subject to ``lower <= x_k <= upper``. ``rho`` is Huber's loss, ``e^2 / 2`` up to ``huber`` and linear beyond: outliers.
+``rho_w`` is quadratic for ``x`` and ``h``, and Huber's loss with ``jump`` for ``d``: loads that come and go. Components
+with neither initial variance nor noise are equality constraints.
 
 **Linearized problem.** One Gauss-Newton step linearizes ``f`` and ``g`` along the last trajectory. With standardized
 unknowns ``xi`` (``z_0 = first + L xi_0``, noises ``sqrt(Q) xi_k``) the rows of outputs and bounds are ``X xi``, and the
 dual problem has one unknown per row::
 
-    min 1/2 l' (X X' + I) l - e' l,    |l_i| <= huber for outputs,    l_i >= 0 for bounds (no I there)
+    min 1/2 l' (X X' + I) l - e' l    with  |l_i| <= huber for outputs,  l_i >= 0 for bounds (no I there),
+                                            |(X' l)_j| <= jump for steps of d
 
-Huber's loss is a box on the multipliers, since the conjugate of a quadratic loss with linear tails is the quadratic on
-an interval; a bound is a row without noise. So outliers and bounds are *one* quadratic program with bounds, which the
-active-set method of the controller solves exactly: no reweighting iterations.
+since the conjugate of a quadratic loss with linear tails is the quadratic on an interval, and a bound is a row without
+noise. Outliers, bounds and jumps are *one* quadratic program with bounds and rows, which the active-set method of the
+controller solves exactly: no reweighting iterations. Then ``xi = X' l``, plus the rows' multipliers for steps of ``d``.
 
 **Why the dual.** 20 periods with z = 32 are 672 unknowns, or 20 to 80 rows. A Riccati recursion costs 40 products of
 32 x 32 matrices for each change of an outlier or bound; here the rows are propagated once backwards through the window
-(:func:`_back`, 20 small products), and each change costs a factorization of the size of the rows. Neither ``P_0`` nor
-``Q`` is inverted, so hidden states without noise and constant disturbances need no special case.
+(20 small products), and each change costs a factorization of the size of the rows. Neither ``P_0`` nor ``Q`` is
+inverted, so hidden states without noise and constant disturbances need no special case.
 
 Sources: Rao, Rawlings, Mayne, *Constrained state estimation for nonlinear discrete-time systems*, IEEE Trans. Automatic
 Control 48 (2003): problem and arrival cost; Kühl, Diehl, Kraus, Schlöder, Bock, *A real-time algorithm for moving
@@ -99,13 +101,14 @@ class WindowEstimate(Estimate):
 
 
 class MovingHorizonEstimator(ExtendedKalmanFilter):
-    """Moving horizon estimator over ``(x, h, d)``, for outliers and bounds; start, noise and restarts are those of
-    :class:`ExtendedKalmanFilter`.
+    """Moving horizon estimator over ``(x, h, d)``, for outliers, bounds and jumps of a load; start, noise and restarts
+    are those of :class:`ExtendedKalmanFilter`.
 
     Each sample takes ``iterations`` Gauss-Newton steps on the window. The arrival cost is that of an extended Kalman
     filter linearized along the window's trajectory; a sample that leaves the window as an outlier keeps its bounded
-    influence. Bounds do not enter the arrival cost: it stays a lower bound of the true one (Rao et al., section 4).
-    For a linear model without bounds and with ``huber=inf`` the estimate is the Kalman filter's, for any window.
+    influence, and a jump its freedom. Bounds do not enter the arrival cost, which for a linear model makes it a lower
+    bound of the true one (Rao et al.). For a linear model without bounds and with ``huber=jump=inf`` the estimate is
+    the Kalman filter's, for any window.
 
     The covariance ``P`` is that of the extended Kalman filter along these estimates; a last sample that is an outlier
     does not reduce it. Likelihood, innovation and NIS are those of the prediction.
@@ -127,11 +130,13 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         huber: Residual in standard deviations from which the loss is linear; ``inf``: no robust loss. Default: 2, with
             which clean samples lose 1 % of their information, and an outlier moves an estimate no further than an
             ordinary error of 2 standard deviations.
+        jump: Step of a disturbance per period, in standard deviations, from which the loss is linear; ``inf``: a jump
+            is as improbable as its standard deviation says. Default: 3.
         iterations: Most Gauss-Newton steps per sample. Default: 1, the real-time iteration.
 
     Raises:
-        InputError: As :class:`ExtendedKalmanFilter`; if a lower bound is not below its upper bound, ``huber`` is not
-            positive, or ``periods`` or ``iterations`` is out of range.
+        InputError: As :class:`ExtendedKalmanFilter`; if a lower bound is not below its upper bound, ``huber`` or
+            ``jump`` is not positive, or ``periods`` or ``iterations`` is out of range.
 
     Example:
         >>> import casadi as ca
@@ -246,9 +251,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         x, h, d = np.split(z, np.cumsum(self._sizes[:2]))
         return replace(own, x=x, h=h, d=d, w=w)
 
-    @np.errstate(
-        over="ignore", invalid="ignore", divide="ignore"
-    )  # what is not finite falls back to the filter
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # without a solution it starts anew
     def assess(
         self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None
     ) -> tuple[WindowEstimate, float]:
@@ -270,18 +273,10 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         x, h, d = np.split(z[-1], np.cumsum(self._sizes[:2]))
         last = outliers[-1] != 0
         p = super().assess(own, np.where(last, np.nan, y), u)[0].P if last.any() else filtered.P
-        return replace(
-            own,
-            x=x,
-            h=h,
-            d=d,
-            P=p,
-            innovation=filtered.innovation,
-            nis=filtered.nis,
-            z=z,
-            ys=ys,
-            outliers=outliers,
-        ), likelihood
+        after = replace(
+            own, x=x, h=h, d=d, P=p, innovation=filtered.innovation, nis=filtered.nis, z=z, ys=ys, outliers=outliers
+        )  # fmt: skip
+        return after, likelihood
 
     def correct(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> WindowEstimate:
         """Estimate after the measurement ``y`` ``(n_y,)``; see :meth:`ExtendedKalmanFilter.correct`."""
