@@ -8,7 +8,8 @@ under random steps of its inputs. Each case changes one thing:
 - ``clean``: nothing.
 - ``outliers``: 2 % of the samples are off by 5 to 50 standard deviations of the sensor, to either side.
 - ``missing``: 20 % of the samples are missing.
-- ``bound``: the tanks run empty, with a pulse of the pump now and then; only for the machine with a bound.
+- ``bound``: the tanks run empty, with a pulse of the pump now and then; only for the machine with a bound. A third
+  table has the Kalman filter whose states are clipped into their ranges after each sample.
 - ``load``: an unmeasured load of 10 % of the inputs' range begins in the middle.
 - ``poor start``: the first sample is off by 100 standard deviations, and states without a sensor by 3 of their first
   ones.
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import tempfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from time import thread_time
 
@@ -38,6 +40,7 @@ KINDS = ("ekf", "ukf", "mhe", "switching")
 CASES = ("clean", "outliers", "missing", "bound", "load", "poor start")
 NOISE = {"two_tanks": 1e-3, "unbalanced_disk": 1e-3, "double_pendulum": 3e-4}
 """Standard deviation of the process noise per period, over the states' sizes."""
+CLIPPED = "clipped ekf"
 HELD = 20
 """Periods between steps of the inputs."""
 
@@ -96,6 +99,11 @@ def errors_of(
     sizes = Sizes(kit.models["prior"], kit.problem()).states
     found: dict[str, list] = {kind: [] for kind in KINDS}
     observers = {kind: kit.observer("prior", kind=kind) for kind in KINDS}
+    low, high = np.full(len(sizes), -np.inf), np.full(len(sizes), np.inf)
+    if case == "bound":
+        observers[CLIPPED] = observers["ekf"]
+        found[CLIPPED], spent[CLIPPED] = [], []
+        low, high = observers["mhe"].lower, observers["mhe"].upper
     for seed in range(seeds):
         xs, ys, us = experiment(kit, case, seed, periods)
         for kind, observer in observers.items():
@@ -105,6 +113,8 @@ def errors_of(
                 begin = thread_time()
                 estimate = observer.update(estimate, ys[k], us[k - 1])
                 spent[kind].append(1e3 * (thread_time() - begin))
+                if kind == CLIPPED:
+                    estimate = replace(estimate, x=np.clip(estimate.x, low, high))
                 squares.append(np.mean(((estimate.x - xs[k]) / sizes) ** 2))
             found[kind].append(np.sqrt(np.mean(squares)))
     return {kind: np.array(values) for kind, values in found.items()}
@@ -151,7 +161,7 @@ def main() -> None:
     parser.add_argument("--periods", type=int, default=200)
     parser.add_argument("--z", type=int, nargs="+", default=[8, 32])
     asked = parser.parse_args()
-    rows, times = [], []
+    rows, times, clipped = [], [], []
     for name in asked.machines:
         kit, spent = kit_of(name), {kind: [] for kind in KINDS}
         for case in CASES:
@@ -159,6 +169,11 @@ def main() -> None:
                 continue
             found = errors_of(kit, case, asked.seeds, asked.periods, spent)
             ratios = {kind: ratio(found[kind], found["ekf"]) for kind in KINDS[1:]}
+            if CLIPPED in found:
+                over = {f"{CLIPPED} / ekf": ratio(found[CLIPPED], found["ekf"])}
+                clipped.append(
+                    {"machine": name, **over, f"mhe / {CLIPPED}": ratio(found["mhe"], found[CLIPPED])}
+                )
             rows.append({"case": case, "machine": name, **ratios})
             print(rows[-1], flush=True)
         times.append({"machine": name, **{f"{kind} [ms]": float(np.median(spent[kind])) for kind in KINDS}})
@@ -167,7 +182,7 @@ def main() -> None:
         own = {f"{kind} [ms]": float(np.median(values)) for kind, values in found.items()}
         times.append({"machine": f"golf_robot, {z} units", **own, f"{KINDS[-1]} [ms]": float("nan")})
     rows.sort(key=lambda row: CASES.index(row["case"]))
-    report([*rows, *times], asked.out)
+    report([*rows, *clipped, *times], asked.out)
 
 
 if __name__ == "__main__":

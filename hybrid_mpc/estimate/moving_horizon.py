@@ -305,7 +305,9 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         e = np.clip(error[seen], -FARTHEST, FARTHEST)
         x = self._back(f, c[seen] / self._sigma_y[output][:, None], time + 1, first_root)
         noise = np.ones(e.size)
-        multipliers, xi, high, e = self._robust(x, e, output, own.outliers[seen])
+        # of two samples, none is known to be the outlier
+        huber = np.inf if len(ys) == 1 < self.periods else self.huber
+        multipliers, xi, high, e = self._robust(x, e, output, own.outliers[seen], huber)
         low, held = -high, np.zeros((len(z), n_x), dtype=bool)
         for _ in range(MOST_ADDED):
             if not np.abs(xi).max(initial=0.0) < IMPOSSIBLE:
@@ -337,7 +339,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         return moved, outliers
 
     def _robust(
-        self, x: Array, e: Array, output: NDArray[np.int64], last: Active
+        self, x: Array, e: Array, output: NDArray[np.int64], last: Active, huber: float
     ) -> tuple[Array, Array, Array, Array]:
         """Multipliers of the measurements without bounds, unknowns ``xi``, the multipliers' limits, and the residuals
         ``e`` without excess.
@@ -346,15 +348,15 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         estimate is wrong and not the sensor (a first sample that was an outlier, an unknown jump): they have the
         quadratic loss.
         """
-        noise, most = np.ones(e.size), np.full(e.size, self.huber)
-        if not np.isfinite(self.huber):
+        noise, most = np.ones(e.size), np.full(e.size, huber)
+        if not np.isfinite(huber):
             return *self._dual(x, noise, e, -most, most), most, e
         h = x @ x.T + np.diag(noise)
         # l_i is at its limit in any case if |e_i| > huber sum_j |h_ij|; larger numbers only cost digits
-        far = FAR * self.huber * np.sum(np.abs(h), axis=1)
+        far = FAR * huber * np.sum(np.abs(h), axis=1)
         e = np.clip(e, -far, far)
         found, xi = self._dual(x, noise, e, -most, most, last)
-        outlier = np.abs(found) >= self.huber * (1 - ROUNDING)
+        outlier = np.abs(found) >= huber * (1 - ROUNDING)
         released, size = np.zeros(e.size, dtype=bool), np.where(outlier, e, 0.0) / np.sqrt(h.diagonal())
         for i in np.unique(output[outlier]):
             own = np.flatnonzero(output == i)
