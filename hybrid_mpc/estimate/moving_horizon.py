@@ -34,6 +34,7 @@ space of the measurements; Huber, *Robust estimation of a location parameter*, A
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,6 +49,7 @@ from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.stages import stages
 
 Array = NDArray[np.float64]
+Scalar = TypeVar("Scalar", bound=np.generic)
 HUBER = 2.0
 """Residual, in the sensor's standard deviations, from which the loss is linear."""
 JUMP = 3.0
@@ -219,10 +221,10 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
             first, first_p = self._later(own)
         return WindowEstimate(
             ahead.t, x, ahead.h, ahead.d, ahead.P, ahead.innovation, ahead.nis,
-            np.vstack([own.z[gone:], np.concatenate([x, ahead.h, ahead.d])]),
-            np.vstack([own.ys[gone:], ahead.innovation]),  # NaN: nothing is measured yet
-            np.vstack([own.us[gone:], sampled(u, (self.model.n_u,), "u")]), np.vstack([own.ws[gone:], ahead.w]),
-            np.vstack([own.outliers[gone:], np.zeros(self.model.n_y, dtype=np.int8)]), first, first_p, w=ahead.w,
+            _and(own.z[gone:], np.concatenate([x, ahead.h, ahead.d])),
+            _and(own.ys[gone:], ahead.innovation),  # NaN: nothing is measured yet
+            _and(own.us[gone:], sampled(u, (self.model.n_u,), "u")), _and(own.ws[gone:], ahead.w),
+            _and(own.outliers[gone:], np.zeros(self.model.n_y, dtype=np.int8)), first, first_p, w=ahead.w,
         )  # fmt: skip
 
     def _later(self, own: WindowEstimate) -> tuple[Array, Array]:
@@ -247,9 +249,9 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         force = np.where(outlier != 0, outlier * self.huber / self._sigma_y, 0.0)
         return first + step + p @ (c.T @ force), p
 
-    def _at(self, own: WindowEstimate, z: Array, w: Array) -> Estimate:
-        x, h, d = np.split(z, np.cumsum(self._sizes[:2]))
-        return replace(own, x=x, h=h, d=d, w=w)
+    def _at(self, own: WindowEstimate, z: Array, w: Array) -> WindowEstimate:
+        n_x, n_z = self._sizes[0], self._sizes[0] + self._sizes[1]
+        return replace(own, x=z[:n_x], h=z[n_x:n_z], d=z[n_z:], w=w)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # without a solution it starts anew
     def assess(
@@ -270,11 +272,11 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         z, outliers = self._solved(own, ys)
         if not np.isfinite(z).all():
             return self.start(y, own.t, w=own.w), likelihood
-        x, h, d = np.split(z[-1], np.cumsum(self._sizes[:2]))
         last = outliers[-1] != 0
         p = super().assess(own, np.where(last, np.nan, y), u)[0].P if last.any() else filtered.P
         after = replace(
-            own, x=x, h=h, d=d, P=p, innovation=filtered.innovation, nis=filtered.nis, z=z, ys=ys, outliers=outliers
+            self._at(own, z[-1], own.w), P=p, innovation=filtered.innovation, nis=filtered.nis, z=z, ys=ys,
+            outliers=outliers,
         )  # fmt: skip
         return after, likelihood
 
@@ -390,19 +392,20 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         """
         (n_x, n_h, n_d, n_y), m, n_u = self._sizes, len(own.us), self.model.n_u
         n_z, model = n_x + n_h, self.model
-        every = np.minimum(np.arange(self.periods), m - 1)  # the functions have the longest window's size
+        # the functions have the longest window's size
+        every = slice(None) if m == self.periods else np.minimum(np.arange(self.periods), m - 1)
         d = z[:-1, n_z:]
         v = [own.us + d @ self._on_u.T, own.ws]
         v += [d @ self._on_x.T] * (model.n_v > n_u + model.n_w)
-        z_next, a_t, b = self._stages.at(z[every, :n_z], np.hstack(v)[every])
+        z_next, a_t, b = self._stages.at(z[:-1][every, :n_z], np.hstack(v)[every])
         f = np.zeros((m, n_z + n_d, n_z + n_d))
         f[:, :n_z, :n_z], f[:, :n_z, n_z:] = a_t[:m].transpose(0, 2, 1), b[:m] @ self._on_u
         f[:, :n_x, n_z:] += self._on_x
         f[:, n_z:, n_z:] = np.eye(n_d)
         defects = np.hstack([z_next[:m], d]) - z[1:]
         x, u, w = (given.reshape(self.periods, -1) for given in self._outputs.inputs)
-        d, ws = z[1:, n_z:], np.vstack([own.ws[1:], own.w])
-        x[:], u[:], w[:] = z[1 + every, :n_x], (own.us + d @ self._on_u.T)[every], ws[every]
+        d, ws = z[1:, n_z:], _and(own.ws[1:], own.w)
+        x[:], u[:], w[:] = z[1:][every, :n_x], (own.us + d @ self._on_u.T)[every], ws[every]
         self._outputs()
         y, by_x, by_u = self._outputs.outputs
         c = np.zeros((m, n_y, n_z + n_d))
@@ -432,9 +435,14 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         return _forward(f, noise, first + first_root @ xi[:n])
 
 
+def _and(rows: NDArray[Scalar], row: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Rows and another one."""
+    return np.concatenate([rows, row[None]])
+
+
 def _forward(f: Array, added: Array, first: Array) -> Array:
     """``dz_{k+1} = F_k dz_k + added_k`` from ``first``: ``(m + 1, n)``."""
-    dz = np.vstack([first, added])
+    dz = np.concatenate([first[None], added])
     for k in range(len(f)):
         dz[k + 1] += f[k] @ dz[k]
     return dz
