@@ -26,10 +26,11 @@ import torch
 from scipy.optimize import least_squares
 
 from hybrid_mpc import Prior, Scenario, TrainingSettings, Trajectory, fit_prior
+from hybrid_mpc.identify.delay import lost_samples
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, required_substeps
 from hybrid_mpc.identify.train import TrainingRun
-from hybrid_mpc.workflow.benchmark_runs import run_freely, warm_samples
+from hybrid_mpc.workflow.benchmark_runs import run_freely
 from nn_export.expressions import scalar_steps
 
 Array = np.ndarray
@@ -133,7 +134,7 @@ def hybrid_mpc(problem: Problem, watch: Watch, seed: int) -> None:
 
     watch.look(partial(predict, "phy", {}))
     train, valid = (smoothed(make, fit, part, dt) for part in (p.train, p.valid))
-    warm = warm_samples(p.warm * dt, fit.delay, dt)
+    warm = max(1, p.warm - lost_samples(fit.delay, dt))
     settings = TrainingSettings(kind="pgrnn", seed=seed, warm=warm, **p.settings)
     run = TrainingRun(prior, train, valid, settings)
     while not run.over:  # as hybrid_mpc.train does

@@ -243,7 +243,7 @@ def study(name: str, data: Path) -> list[Row]:
     for own, other in (machine.clean, machine.clean[::-1]):
         learned = [given(run) for run in held] + clean[own]
         readings = ResidualReadings(model)
-        limits = learn_limits(readings, estimator, learned, false_alarms_per_hour=rates(model))
+        limits = learn_limits(readings, estimator, learned, false_alarms_per_hour=rates(scenario, model))
         monitor, diagnoser = Monitor(readings, limits), Diagnoser(model, limits)
         told = "; ".join(f"{c.channel} {c.words(limits.dt)}" for c in limits.channels)
         print(f"limits from {own}: {limits.method}; {told}")

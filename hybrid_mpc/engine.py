@@ -24,8 +24,6 @@ from hybrid_mpc.rules import counted
 
 WORKERS = min(2, os.cpu_count() or 1)
 """Number of parallel processes: at most two, the cores of the reference machine."""
-WATCH_S = 0.5
-"""Time [s] between a worker's checks that its parent is alive."""
 REPORT_S = 0.02
 """Time [s] that :func:`run_jobs` waits for a report before it checks whether a job has ended."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -468,7 +466,8 @@ def _began(parent: int, begin: Callable[[], None] | None) -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(WATCH_S)
+            # time [s] between a worker's checks that its parent is alive
+            time.sleep(0.5)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -143,15 +143,11 @@ def no_exit(what: str = "") -> Iterator[None]:
         frames = [frame for frame in passed if not frame.filename.startswith("<frozen")]
         place = f"{frames[-1].filename}:{frames[-1].lineno}: " if frames else ""
         of = f"{what}: " if what and not place.startswith(what) else ""
+        ending = f"SystemExit({stop.code!r})" if isinstance(stop, SystemExit) else type(stop).__name__
         raise InputError(
-            f"{of}{place}{_ending(stop)} would end Python. Remove sys.exit or exit, or move the script's code "
+            f"{of}{place}{ending} would end Python. Remove sys.exit or exit, or move the script's code "
             'under if __name__ == "__main__": [HM-ERRORS-002]'
         ) from stop
-
-
-def _ending(stop: BaseException) -> str:
-    """The exception that would end Python, as text."""
-    return f"SystemExit({stop.code!r})" if isinstance(stop, SystemExit) else type(stop).__name__
 
 
 SHOWN = 20

@@ -36,8 +36,6 @@ MOST_CONTENT = 2**31
 """Largest user file that is read [byte]."""
 MOST_MEMBERS = 10_000
 """Most arrays in a file."""
-HEADER = 10_100
-"""First bytes of an array, which contain its header: numpy reads at most 10 000 characters of it [byte]."""
 HASH, ARRAYS_HASH = "sha256", "arrays_sha256"
 """Fields of a document with the hashes of its content and of the arrays beside it."""
 LOCK, PART = ".lock", ".part"
@@ -239,7 +237,8 @@ def _declared(archive: zipfile.ZipFile, name: str) -> int:
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"member {name[:80]!r} is not compressed like numpy's [HM-FILES-007]")
     with archive.open(member) as file:
-        begin = io.BytesIO(file.read(HEADER))
+        # first bytes of an array, which contain its header: numpy reads at most 10 000 characters of it [byte]
+        begin = io.BytesIO(file.read(10_100))
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(npy.read_magic(begin))
     if read is None:
         raise ValueError(f"member {name[:80]!r} is not an array of numbers [HM-FILES-008]")
@@ -306,13 +305,12 @@ def digest(value: Any) -> str:
 def is_empty(folder: Path) -> bool:
     """Whether a folder is missing, or holds only leftovers of a killed writer or a lock."""
     try:
-        return not folder.exists() or (folder.is_dir() and all(_leftover(path) for path in folder.iterdir()))
+        if not folder.is_dir():
+            return not folder.exists()
+        names = [path.name for path in folder.iterdir()]
+        return all(name == LOCK or (name.startswith(".") and name.endswith(PART)) for name in names)
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: cannot be listed: {reason(error)} [HM-FILES-012]") from error
-
-
-def _leftover(path: Path) -> bool:
-    return path.name == LOCK or (path.name.startswith(".") and path.name.endswith(PART))
 
 
 def check_folder(folder: Path) -> None:

@@ -28,8 +28,6 @@ LARGEST = 2**63
 """Integers of this size or more are refused: no array, seed or count can hold them."""
 LONGEST = 40
 """Most characters of a text in a message."""
-LONGEST_WHAT = 100
-"""Most characters of a record's description in a message."""
 MOST_NAMED = 20
 """Most problems of one file that are listed; a damaged file may have thousands."""
 BESIDE = {"beside": True}
@@ -209,7 +207,8 @@ class Fields:
     """
 
     def __init__(self, made: Any, what: str) -> None:
-        self._what = printable(what).replace("\n", " ")[:LONGEST_WHAT]
+        # most characters of a record's description in a message
+        self._what = printable(what).replace("\n", " ")[:100]
         self._problems, self._wrong = list[str](), set[str]()
         hints = _hints(type(made))  # type: ignore[arg-type]
         for name in (f.name for f in dataclasses.fields(made)):

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +18,17 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError, no_exit, said_by
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.signals import Parameter, Signal
-from hybrid_mpc.machine.specification import BenchmarkSpec, ChoiceRule, Count, CountOrNone, DataSpec
+from hybrid_mpc.machine.specification import (
+    BenchmarkBudget,
+    BenchmarkSpec,
+    ChoiceRule,
+    Count,
+    CountOrNone,
+    DataSpec,
+)
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.records import Fields
-from hybrid_mpc.rules import Line, Name, NotNegative, Number, Seconds, Text
+from hybrid_mpc.rules import Line, Name, NotNegative, Number, Positive, Seconds, Text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,37 +117,23 @@ class Task:
         own.refuse()
 
 
-@dataclass(frozen=True)
-class Budget:
-    """Effort of one run of the main job.
+@dataclass(frozen=True, kw_only=True)
+class Budget(BenchmarkBudget):
+    """Effort of one run of the main job: of its training, and of its closed loops.
 
     Args:
-        hidden: Hidden units of each network.
-        networks: Networks trained per model, each without another part of the data. Their mean is deployed: one network
-            of ``networks * hidden`` hidden units z, which determines the time of a control step.
-        teacher_steps: Optimiser steps with teacher forcing.
-        free_run_steps: Optimiser steps on free runs.
         seeds: Most closed loops per task and controller; fewer if they suffice to distinguish the controllers' costs.
         oracle_seeds: Most closed loops per task of the oracles, which are slow; never more than of the others.
         tasks: Names of the tasks to run. Default: all.
-        decay: Weight decay times the number of training samples: fewer samples need more decay against overfitting.
-            Default: 300.
-        prior_replay: Weight that fades corrections where nothing was measured (``TrainingSettings``), for a machine
-            whose tasks leave the range of its recordings. Default: zero.
+
+    Example:
+        >>> Budget(8, 4, 200, 200, seeds=2).horizon
+        50
     """
 
-    hidden: Count
-    networks: Count
-    teacher_steps: CountOrNone
-    free_run_steps: CountOrNone
     seeds: Count
-    decay: NotNegative = 300.0
     oracle_seeds: CountOrNone = 1
     tasks: tuple[Name, ...] | None = None
-    prior_replay: NotNegative = 0.0
-
-    def __post_init__(self) -> None:
-        Fields(self, "budget").refuse()
 
 
 DEFAULT_BUDGETS: Mapping[str, Budget] = {
@@ -193,9 +187,12 @@ class Scenario:
             ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Default, if no law is named: all
             laws, besides the own terms.
         choice: How sure held-out data must show that a hybrid is better than the fitted prior. Default: 95 %.
+        false_alarms_per_hour: Wanted rates of the monitor's false alarms [1/h], in rising order; limits are learned for
+            the first rate that the undisturbed data are long enough for. A machine that stops at an alarm needs lower
+            rates, and longer recordings. Default: 1, 2, 5 and 10, over the machine's time unit [s].
 
     Raises:
-        InputError: With all fields of a wrong kind, and equal names of tasks.
+        InputError: With all fields of a wrong kind, equal names of tasks, and rates that do not rise.
 
     Example:
         >>> spec = DataSpec("time_s", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.5)
@@ -226,6 +223,7 @@ class Scenario:
     disturbance_model: tuple[Disturbance, ...] | None = None
     terms: tuple[Term | Name, ...] = ()
     choice: ChoiceRule = field(default_factory=ChoiceRule)
+    false_alarms_per_hour: tuple[Positive, ...] = ()
 
     def __post_init__(self) -> None:
         own = Fields(self, f"scenario {self.name!r}")
@@ -233,6 +231,11 @@ class Scenario:
             "control",
             lambda: _is_problem(self.control),
             f"control: must be OCP(...), got {self.control!r:.60} [HM-SCENARIO-002]",
+        )
+        own.need(
+            "false_alarms_per_hour",
+            lambda: all(one < two for one, two in pairwise(self.false_alarms_per_hour)),
+            f"false_alarms_per_hour: rates must rise, got {self.false_alarms_per_hour} [HM-SCENARIO-011]",
         )
         own.distinct("tasks", lambda: [task.name for task in self.tasks], "tasks: the name")
         own.refuse()

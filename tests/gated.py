@@ -27,3 +27,19 @@ def gated(seed, units=16):
         "gated", 1.0, (tank, wall), (Signal("power", "W"),), (tank,), x=x, h=h, u=u, x_next=x + rate, h_next=h_next,
         xdot=rate, y=x[0], nominal_x=(0.5, 4.0), nominal_u=(0.5,),
     )  # fmt: skip
+
+
+def saturated(seed, units):
+    """A tank with a wall, of whose rates a saturated memory of level and inflow takes a part."""
+    rng = np.random.default_rng(seed)
+    x, h, u = ca.SX.sym("x", 2), ca.SX.sym("h", units), ca.SX.sym("u", 2)
+    w_h = rng.normal(size=(units, units)) * 0.9 / np.sqrt(units)
+    w_x, out = 4.0 * rng.normal(size=(units, 4)), 0.2 * rng.normal(size=(2, units)) / np.sqrt(units)
+    h_next = ca.tanh(w_h @ h + w_x @ ca.vertcat(x, u) + rng.normal(size=units))
+    rate = ca.vertcat(u[0] - ca.sqrt(0.1 + x[0] ** 2), u[1] - u[0] * x[1]) + out @ h_next
+    levels = (Signal("level", "m", -2, 2), Signal("heat", "K", -2, 2))
+    return HybridModel.of(
+        "memory", 0.1, levels, (Signal("in", "m/s"), Signal("power", "K/s")), levels,
+        x=x, h=h, u=u, x_next=x + 0.02 * rate, h_next=h_next, xdot=rate, y=x,
+        nominal_x=(0.5, 0.5), nominal_u=(0.6, 0.4),
+    )  # fmt: skip

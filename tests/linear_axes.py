@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 from monitor_parts import Run
+from online_models import rk4
 
 from hybrid_mpc import ExtendedKalmanFilter, HybridModel, Parameter, Signal
 
@@ -32,17 +33,11 @@ class Axis:
         def rhs(x):
             return ca.vertcat(x[1], force(x) / p[0])
 
-        z, n = x, 8
-        for _ in range(n):
-            d = self.dt / n
-            k1 = rhs(z)
-            k2 = rhs(z + d / 2 * k1)
-            k3 = rhs(z + d / 2 * k2)
-            z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
         known = Parameter("m", self.mass, "kg", 0.0, 1e6), Parameter("d", self.viscous, "N s/m", 0.0, 1e6)
         model = HybridModel.of(
             "axis", self.dt, (Signal("q", "m"), Signal("v", "m/s")), (Signal("F", "N"),), (Signal("q", "m"),),
-            x=x, u=u, p=p, x_next=z, xdot=rhs(x), y=x[0], rate=rate, energy=(p[0] * rate[1] - force(x)) * x[1],
+            x=x, u=u, p=p, x_next=rk4(rhs, x, self.dt, 8), xdot=rhs(x), y=x[0], rate=rate,
+            energy=(p[0] * rate[1] - force(x)) * x[1],
             parameters=known,
         )  # fmt: skip
         return replace(model, time_unit=self.time_unit)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from online_models import rk4
 
 from hybrid_mpc import ChannelLimit, EnergyReadings, HybridModel, Monitor, Parameter, Signal, WatchLimits
 
@@ -21,17 +22,11 @@ def pendulum(
     def rhs(x):
         return ca.vertcat(x[1], torque(x) / p[0])
 
-    z = x
-    for _ in range(4):
-        d = DT / 4
-        k1 = rhs(z)
-        k2 = rhs(z + d / 2 * k1)
-        k3 = rhs(z + d / 2 * k2)
-        z = z + d / 6 * (k1 + 2 * k2 + 2 * k3 + rhs(z + d * k3))
     return HybridModel.of(
         "pendulum", DT, (Signal("phi", "rad"), Signal("phi_dot", "rad/s")), (Signal("tau", "N m"),),
         (Signal("phi", "rad"),),
-        x=x, u=u, p=p, x_next=z, xdot=rhs(x), y=x[0], rate=rate, energy=(p[0] * rate[1] - torque(x)) * x[1],
+        x=x, u=u, p=p, x_next=rk4(rhs, x, DT, 4), xdot=rhs(x), y=x[0], rate=rate,
+        energy=(p[0] * rate[1] - torque(x)) * x[1],
         parameters=(
             Parameter("J", inertia, "kg m^2", 0.0, 100.0), Parameter("mgl", mgl, "N m", 0.0, 100.0),
             Parameter("gamma", friction, "N m s", 0.0, 100.0),

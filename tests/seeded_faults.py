@@ -108,9 +108,9 @@ FAULTS = (
         "friction",
     ),
     fault(
-        "machine", "a Stribeck curve starts above its static level",
-        "(level + (static - level) * (-ratio * ratio).exp())", "(level + static * (-ratio * ratio).exp())",
-        "friction",
+        "machine", "a Stribeck curve falls with the squared speed over the Stribeck speed, not over its square",
+        "ca.exp(-((at.own / speed) ** 2))", "ca.exp(-(at.own**2) / speed)",
+        "terms",
     ),
     fault(
         "machine", "the shares of the two inputs that act within one period are swapped",
@@ -119,8 +119,8 @@ FAULTS = (
     ),
     fault(
         "data", "the input of a period is the mean over the period before",
-        "(_interpolate(t, integral, grid + dt) - _interpolate(t, integral, grid)) / dt",
-        "(_interpolate(t, integral, grid) - _interpolate(t, integral, grid - dt)) / dt",
+        "(np.interp(grid + dt, t, z) - np.interp(grid, t, z)) / dt",
+        "(np.interp(grid, t, z) - np.interp(grid - dt, t, z)) / dt",
         "trajectories",
     ),
     fault(
@@ -130,7 +130,7 @@ FAULTS = (
     ),
     fault(
         "data", "a time stamp that repeats is accepted",
-        "if (steps <= 0).any():", "if (steps < 0).any():",
+        "wrong = np.diff(t) <= 0", "wrong = np.diff(t) < 0",
         "read",
     ),
     fault(
@@ -208,7 +208,7 @@ FAULTS = (
     ),
     fault(
         "control", "a bound on states is held a period too early",
-        "np.repeat(np.arange(n) + (b == 0), size)", "np.repeat(np.arange(n), size)",
+        "np.repeat(np.arange(n) + (b == 0), count)", "np.repeat(np.arange(n), count)",
         "soft",
     ),
     fault(
@@ -247,8 +247,8 @@ FAULTS = (
     ),
     fault(
         "watch", "a force that pulls the other way is not detected",
-        "up, down = sums[i] + z - drift, sums[n + i] - z - drift",
-        "up, down = sums[i] + z - drift, sums[n + i] + z - drift",
+        "up, down = sums[2 * k] + z - drift, sums[2 * k + 1] - z - drift",
+        "up, down = sums[2 * k] + z - drift, sums[2 * k + 1] + z - drift",
         "detector", "golden",
     ),
     fault(
@@ -258,12 +258,12 @@ FAULTS = (
     ),
     fault(
         "watch", "a sensor that freezes while the machine moves backwards is not noticed",
-        "any(abs(travel) > FROZEN_STEPS * step for", "any(travel > FROZEN_STEPS * step for",
+        "if within and abs(moved) > far", "if within and moved > far",
         "frozen",
     ),
     fault(
-        "watch", "a diagnosis takes overlapping windows for independent ones",
-        "covariance[np.ix_(used, used)] = overlap * pseudo", "covariance[np.ix_(used, used)] = pseudo",
+        "watch", "a diagnosis takes correlated samples for independent ones",
+        "independent = max(samples / self.short, 2.0)", "independent = samples",
         "diagnosis",
     ),
     fault(
@@ -298,7 +298,7 @@ FAULTS = (
     ),
     fault(
         "compare", "an interval of 95 % is one of 90 %",
-        "student.ppf(0.975, n - 1)", "student.ppf(0.95, n - 1)",
+        "student.ppf(0.5 + level / 2, n - 1)", "student.ppf(level, n - 1)",
         "interval",
     ),
     fault(

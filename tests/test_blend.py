@@ -103,6 +103,13 @@ def test_a_kit_runs_prior_and_hybrid_side_by_side(kit):
     assert np.ptp(result.w) > 0.0
 
 
+def test_a_kit_that_recommends_the_prior_asks_for_a_start(kit):
+    careful = replace(kit, recommended="prior")
+    with pytest.raises(hm.InputError, match="HM-KIT-042"):
+        careful.blended()
+    assert careful.blended(0.5).models["hybrid"].p[-1] == 0.5
+
+
 @pytest.mark.parametrize("share", [0.0, 2.0, np.nan])
 def test_a_share_at_its_bound_could_not_move(kit, share):
     with pytest.raises(hm.InputError, match="HM-KIT-041"):

@@ -81,16 +81,12 @@ Point = tuple[Array, Array]
 POINTS = ("rest", "working", "moving", "driven")
 """Linearizations: tangent at rest; describing function of motions of working size; tangent in motion at working speed;
 mean along a driven run. Only mechanical models have ``"working"`` and ``"moving"``."""
-LARGEST_ZERO = 1e6
-"""Zeros larger than this are rounding errors: zeros at infinity (of a delay) that are computed as finite."""
 LEVEL = 0.5
 """Amplitude of the multisine over half the input's range."""
 PERIOD, PERIODS, BAND = 20.0, 4, (0.1, 3.0)
 """Multisine for frequency responses: its period [time units], number of counted periods, and band [1 / time unit]."""
 DRIVEN, DRIVEN_BAND = 30.0, (0.1, 1.5)
 """Driven run: its length [time units], and the band of its multisine [1 / time unit]."""
-POSITIONS = 21
-"""Positions of the gain schedule."""
 
 
 @dataclass(frozen=True)
@@ -461,7 +457,8 @@ def _scaled(given: AnalysisInput, model: HybridModel, system: Any) -> Any:
 def _zeros(system: Any) -> Complex:
     """Finite zeros of a system with as many inputs as outputs."""
     found = np.asarray(system.zeros(), dtype=np.complex128)
-    return found[np.abs(found) < LARGEST_ZERO]
+    # zeros larger than this are rounding errors: zeros at infinity (of a delay) that are computed as finite
+    return found[np.abs(found) < 1e6]
 
 
 def _reduced(given: AnalysisInput, model: HybridModel, point: Point, system: Any, omega: Array) -> Reduction:
@@ -544,7 +541,8 @@ def schedules_of(given: AnalysisInput) -> dict[str, ScheduleAnalysis]:
     for name, model in sorted(given.models.items(), key=lambda m: m[1].n_h):
         if model.n_x != 2 or model.n_u != 1:
             raise InputError("gain schedule: only computed for one position and one input [HM-ANALYZE-005]")
-        points, not_held = _held(model, np.linspace(given.x_range[0, 0], given.x_range[0, 1], POSITIONS))
+        # positions of the gain schedule
+        points, not_held = _held(model, np.linspace(given.x_range[0, 0], given.x_range[0, 1], 21))
         weights = ocp.q * model.dt, (ocp.r + ocp.r_delta) * model.dt
         found[name] = ScheduleAnalysis(
             gain_schedule(model, points, *weights),

@@ -22,13 +22,9 @@ from hybrid_mpc.model.model import HybridModel
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 STARTS = 64
-SETTLES = 100
-"""Maximum number of periods in which a hidden state settles before a search begins."""
 SAME = 1e-5
 """Distance, over the region's size, below which two solutions are the same equilibrium. The error of Newton's method is
 far smaller: the residual of 1e-10 over the distance of the slowest mode from 1."""
-MARGINAL = 1e-7
-"""Distance of an eigenvalue from the unit circle that is within rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +122,8 @@ def equilibria(
     found: list[tuple[Array, float, int]] = []
     converged = 0
     for start in box[:, 0] + (unit + 0.5 / starts) % 1.0 * size:
-        v = np.concatenate([start, hidden_fixed_point(model, start, held, limit=SETTLES), held])
+        # maximum number of periods in which a hidden state settles before a search begins
+        v = np.concatenate([start, hidden_fixed_point(model, start, held, limit=100), held])
         end = search.descend(v, none).v
         z, error = _move_by_turns(model, end[:n_z], box), residual_of(search, end)
         x = z[: model.n_x]
@@ -156,7 +153,8 @@ def _point(model: HybridModel, z: Array, error: float, hits: int, u: Array) -> E
     assert model.with_jacobian is not None
     poles = poles_of(model.with_jacobian(x, h, u, model.w, model.p)[2].full())
     over = float(np.abs(poles[0])) - 1.0
-    stability = "marginal" if abs(over) <= MARGINAL else "stable" if over < 0 else "unstable"
+    # distance of an eigenvalue from the unit circle that is within rounding errors
+    stability = "marginal" if abs(over) <= 1e-7 else "stable" if over < 0 else "unstable"
     return Equilibrium(x, h, u, error, poles, stability, hits)
 
 

@@ -40,8 +40,6 @@ number of correct digits."""
 DIFFERENCE = 1e-4
 """Step of a central difference over a signal's size. The truncation error is proportional to the step squared; the
 error of the solves (1e-9) is divided by the step."""
-INTEGRATES = 1e-5
-"""Distance from 1 at which a pole counts as an integrator: rounding (1e-16) moves a triple pole by its third root."""
 MOST_DELAY = 200
 """Maximum number of whole periods of delay that are tried."""
 
@@ -595,7 +593,8 @@ def _steady_gain(sys: Any) -> float:
     a, b, c, d = matrices(sys)
     if not len(a):
         return float(d.item())
-    if np.abs(np.linalg.eigvals(a) - 1.0).min() < INTEGRATES:
+    # distance from 1 at which a pole counts as an integrator: rounding (1e-16) moves a triple pole by its third root
+    if np.abs(np.linalg.eigvals(a) - 1.0).min() < 1e-5:
         return 0.0
     return float((c @ np.linalg.solve(np.eye(len(a)) - a, b) + d).item())
 

@@ -21,8 +21,6 @@ Run: TypeAlias = Callable[[Array], Array]
 """Function from inputs ``(n,)`` to outputs ``(n,)`` of one channel; each output is measured before its input acts."""
 LARGEST = 1e60
 """Size of a sample above which a run has diverged: products of its powers would overflow."""
-BY_CHANCE = 0.01
-"""Significance level: share of the frequencies of unrelated signals whose coherence passes the test."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,8 @@ class MeasuredResponse:
         Source: Carter, Knapp and Nuttall, *Estimation of the magnitude-squared coherence function via overlapped fast
         Fourier transform processing*, IEEE Trans. Audio Electroacoust. 21 (1973).
         """
-        unrelated = 1.0 if self.averages <= 1 else 1.0 - BY_CHANCE ** (1.0 / (self.averages - 1.0))
+        # significance level: share of the frequencies of unrelated signals whose coherence passes the test
+        unrelated = 1.0 if self.averages <= 1 else 1.0 - 0.01 ** (1.0 / (self.averages - 1.0))
         return np.asarray(np.isfinite(self.response) & (self.coherence > unrelated))
 
 

@@ -10,6 +10,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit
 
 from hybrid_mpc.analyze.linearize import linearize_along
 from hybrid_mpc.errors import InputError
@@ -20,10 +21,6 @@ from nn_export import Node, Port, Program, build
 Array = NDArray[np.float64]
 Interval = tuple[float, float]
 CELL = "aten.gru_cell.default"
-REFINEMENTS = 50
-"""Iterations that narrow the box of hidden states; the box converges much earlier."""
-SETTLE = 0.2
-"""Share of the run at its start in which the tangent vector aligns; it is not evaluated."""
 BLOCKS = 10
 """Stretches of the run; their scatter gives the standard deviation of the exponent."""
 
@@ -270,9 +267,10 @@ def contraction(cell: GruWeights, lower: ArrayLike, upper: ArrayLike) -> Contrac
     n = cell.r.shape[1]
     driven = _affine(cell.w, low, high, cell.b_w)
     h = -np.ones(n), np.ones(n)
-    for _ in range(REFINEMENTS):
+    # iterations that narrow the box of hidden states; the box converges much earlier
+    for _ in range(50):
         recurrent = _affine(cell.r, *h, cell.b_r)
-        r, z = (tuple(_sigmoid(d[g] + e[g]) for d, e in zip(driven, recurrent, strict=True))
+        r, z = (tuple(expit(d[g] + e[g]) for d, e in zip(driven, recurrent, strict=True))
                 for g in (slice(0, n), slice(n, 2 * n)))  # fmt: skip
         a = recurrent[0][2 * n :], recurrent[1][2 * n :]
         products = np.stack([p * q for p in r for q in a])
@@ -307,10 +305,6 @@ def _cell(program: Program) -> Node:
 def _affine(w: Array, low: Array, high: Array, b: Array) -> tuple[Array, Array]:
     middle, half = w @ (0.5 * (low + high)) + b, np.abs(w) @ (0.5 * (high - low))
     return middle - half, middle + half
-
-
-def _sigmoid(v: Array) -> Array:
-    return np.asarray(0.5 * (1 + np.tanh(0.5 * v)))
 
 
 def _perron(matrix: Array) -> tuple[float, Array]:
@@ -392,7 +386,8 @@ def lyapunov_exponent(
             )
         steps[k] = np.log(size)
         v = np.asarray(v / size)
-    counted = steps[int(SETTLE * n) :]
+    # share of the run at its start in which the tangent vector aligns; it is not evaluated
+    counted = steps[int(0.2 * n) :]
     means = np.array([b.mean() for b in np.array_split(counted, BLOCKS)]) / model.dt
     deviation = float(means.std(ddof=1) / np.sqrt(BLOCKS))
     return LyapunovExponent(float(counted.mean()) / model.dt, deviation, np.append(0.0, np.cumsum(steps)))

@@ -22,8 +22,6 @@ RANK_TOLERANCE = 1e-8
 this distance would need inputs 1e8 times larger than other modes."""
 EDGE = 1e-9
 """Distance of a pole from the unit circle below which the pole has no Gramian and is kept."""
-NOTHING = 1e-14
-"""Share of the largest Hankel singular value below which a value is rounding; such states are always truncated."""
 
 
 class Mode(NamedTuple):
@@ -355,7 +353,8 @@ def _balance(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
     reach = _root(solve_discrete_lyapunov(a, b @ b.T, method="bilinear"))
     see = _root(solve_discrete_lyapunov(a.T, c.T @ c, method="bilinear"))
     left, values, right = np.linalg.svd(see.T @ reach)
-    there = int(np.sum(values > NOTHING * values[0])) if values.size and values[0] > 0 else 0
+    # share of the largest Hankel singular value below which a value is rounding; such states are always truncated
+    there = int(np.sum(values > 1e-14 * values[0])) if values.size and values[0] > 0 else 0
     scale = 1.0 / np.sqrt(values[:there])
     return values, (see @ left[:, :there] * scale).T, reach @ right[:there].T * scale
 

@@ -25,8 +25,6 @@ from hybrid_mpc.rules import LARGEST, column_problem, counted
 Array = NDArray[np.float64]
 MOST_RECORDED = 1e-3 * LARGEST
 """Largest number of a signal; the signal's range, wider than the recording, must stay below ``LARGEST``."""
-EVEN = 0.2
-"""Largest relative spread of evenly spaced time stamps."""
 COUNTED = (
     "the column counts samples and is used as the time, since no column is named as time. Write the seconds of one "
     "count into units, and multiply all lengths below by it"
@@ -34,8 +32,6 @@ COUNTED = (
 """Doubt about a time that is a count of samples."""
 UNNAMED = "the column rises evenly and no column is named as time. Check that it is the time in seconds"
 NO_UNIT = "its name has no unit. Check that it is in seconds"
-LONGEST_NAME = 40
-"""Most characters of a signal's name."""
 EPOCHS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3), (1e9, 1.0))
 """Smallest time since 1970 (in the year 2001) in each unit [s]; a number five times larger (after 2130) is no epoch."""
 UNIT = re.compile(r"[\w/^*·.%°²³µμΩ() -]{1,20}")
@@ -47,8 +43,6 @@ LIMITS: Mapping[str, Sequence[float]] = {
     "": (-1.0, 0.0, 1.0),
 }
 """Usual limits of actuators, by unit (empty: no unit)."""
-AT_LIMIT = 2e-3
-"""Largest distance of a recorded end from such a limit, in spans."""
 DIVERGED, AGAIN = 1e12, 3
 """Least size of diverged numbers, over a column's median size; and the fewest such numbers."""
 
@@ -82,7 +76,8 @@ class Column:
     @property
     def identifier(self) -> str:
         """The name as a Python identifier."""
-        text = ascii_of(self.name)[:LONGEST_NAME].strip("_") or "signal"
+        # most characters of a signal's name
+        text = ascii_of(self.name)[:40].strip("_") or "signal"
         return f"c_{text}" if text[0].isdigit() or keyword.iskeyword(text) else text
 
     @property
@@ -106,7 +101,8 @@ class Column:
         An end at exactly zero is one in any unit.
         """
         low, high = self.span
-        near_by = AT_LIMIT * (high - low)
+        # largest distance of a recorded end from such a limit, in spans
+        near_by = 2e-3 * (high - low)
         usual = LIMITS.get("" if self.unit in ("", "-", "1") else self.unit, ())
         below = [0.0] if low == 0.0 else [end for end in usual if 0 <= low - end <= near_by]
         above = [0.0] if high == 0.0 else [end for end in usual if 0 <= end - high <= near_by]
@@ -439,7 +435,8 @@ def _mostly_even(values: Array) -> bool:
     """Whether most numbers rise evenly, like a time that may repeat, restart or have gaps."""
     steps = np.diff(values[np.isfinite(values)])
     middle = float(np.median(steps)) if len(steps) else 0.0
-    return middle > 0 and bool(np.quantile(np.abs(steps / middle - 1), 0.9) < EVEN)
+    # largest relative spread of evenly spaced time stamps
+    return middle > 0 and bool(np.quantile(np.abs(steps / middle - 1), 0.9) < 0.2)
 
 
 def _is_count(values: Array) -> bool:

@@ -20,8 +20,6 @@ from hybrid_mpc.model.equilibrium import RateEquations, rate_search
 from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
-TOLERATED = 10.0
-"""Largest step, over the deviation that the weights tolerate, ``1 / sqrt(q)``."""
 ROOM, PUSH = 0.5, 0.2
 """Largest shares of the distance from the operating point to a limit: of a step, and of a disturbance at an input."""
 HOLD, LEAD, LASTS = 3, 0.5, 6
@@ -177,7 +175,8 @@ def _steps(rest: _Rest) -> list[tuple[int, float, Array]]:
     """Index and size of each step, and all references at the new steady state."""
     found = []
     for j in np.flatnonzero(rest.weights > 0).tolist():
-        size = TOLERATED / math.sqrt(rest.weights[j])
+        # largest step, over the deviation that the weights tolerate, ``1 / sqrt(q)``
+        size = 10.0 / math.sqrt(rest.weights[j])
         candidates = ((sign, size / 2**k) for k in range(12) for sign in (1.0, -1.0))
         for sign, own in candidates:
             point = rest.moved([j], sign * own, np.array([own]))

@@ -19,8 +19,6 @@ FEWEST = 20
 """Fewest rows of a usable recording."""
 MOST, JUDGED = 4000, 20_000
 """Most samples to which a lag is fitted, and on which it is evaluated."""
-BETTER = 0.8
-"""Largest error of two states over that of one state with which two are used."""
 MATTERS = 0.1
 """Least share of an output's variance that its lag explains, for its time constant to matter."""
 STRIDES = (1, 4, 16)
@@ -31,8 +29,6 @@ FAR = 5.0
 """Least steady-state effect of all inputs, over the output's span, of an output that integrates."""
 LAGS = 4
 """Past samples from which outputs are predicted."""
-ROWS = 10_000
-"""Most samples of a recording to which these predictions are fitted."""
 CLOSED = 2.0
 """Feedback, over its largest value by chance (:func:`~hybrid_mpc.identify.closed_loop.feedback`), above which a loop is
 closed. In eight recordings of machines it was 1.3 at most in open loop, and 2.2 to 34 in detectable closed loops."""
@@ -145,7 +141,8 @@ def first_lag(runs: Sequence[Runs], output: int, dt: float, inputs: int) -> Lag:
     if not best:
         return default
     error, lag = best.get(1, best.get(2, (0.0, default)))
-    if 2 in best and best[2][0] < BETTER * error:
+    # largest error of two states over that of one state with which two are used
+    if 2 in best and best[2][0] < 0.8 * error:
         lag = best[2][1]
     gains = span / spans * np.array(lag.gains)
     offset = float(middle[0] + span * lag.offset - gains @ middle[1:])
@@ -293,7 +290,8 @@ def _middles(runs: Sequence[Runs], stride: int) -> list[Runs]:
     middle, size = [np.nanmean(z, axis=0) for z in (y, u)], [np.nanstd(z, axis=0) for z in (y, u)]
     parts = []
     for run in runs:
-        rows = min(ROWS, len(run.y) // stride)
+        # most samples of a recording to which these predictions are fitted
+        rows = min(10_000, len(run.y) // stride)
         first = (len(run.y) - stride * rows) // 2
         y0, u0 = (z[first : first + stride * rows] for z in run)
         # inputs are averaged over the stride in which they act

@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-PAUSE = 5.0
-"""Least gap in the time, in median steps; ``new`` writes it as ``max_gap``."""
-MOST_PLOTTED = 12
-"""Most columns in the picture."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,8 @@ def _time(source: Source, findings: list[str], rows: int) -> tuple[str, Array, s
     if len(t) == 1:
         return f"{shown(name)}: sampled every {clock.period:.4g} s", clock.period * count, name
     steps = np.diff(t)
-    gaps = np.flatnonzero(steps > PAUSE * clock.period)
+    # least gap in the time, in median steps; ``new`` writes it as ``max_gap``
+    gaps = np.flatnonzero(steps > 5.0 * clock.period)
     told = f"{shown(name)}: {t[0]:.10g} to {t[-1]:.10g} s, sampled every {clock.period:.4g} s"
     place = source.read(None, [name], ()).place
     if len(gaps):
@@ -158,7 +155,8 @@ def picture(found: Look) -> Figure:
         for one in found.columns
         if one.low != one.high and one.note != "time" and len(one.values) == len(found.t)
     ]
-    figure, panels = new_column([1.0] * max(1, len(moving[:MOST_PLOTTED])), title=found.path.name)
+    # most columns in the picture
+    figure, panels = new_column([1.0] * max(1, len(moving[:12])), title=found.path.name)
     for panel, one in zip(panels, moving, strict=False):
         known = np.isfinite(one.values)
         panel.plot(found.t[known], one.values[known], color="black", linewidth=0.9)

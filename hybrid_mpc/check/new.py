@@ -38,8 +38,6 @@ SMOOTHED = 7
 """Fewest sampling periods of smoothing: a polynomial of order 4 needs six samples, and stamps are rounded."""
 GUESSED = 0.005
 """Guessed error of a sensor whose noise the recordings do not show, in spans of the output."""
-WHITE = 0.6
-"""Least noise found by fourth differences, over that by third ones, that is noise and no motion."""
 INTEGRATES = "the recordings are too short to show a steady state"
 """Remark on the rate of an output that integrates."""
 HORIZONS = 20, 100
@@ -123,7 +121,8 @@ class Draft:
             known = column.values[np.isfinite(column.values)]
             step = float(np.diff(np.unique(known)).min(initial=np.inf)) / np.sqrt(12.0)
             guess = GUESSED * float(np.ptp(column.span))
-            shown_there = sigma > 0 and fourth > WHITE * sigma and guess > 0
+            # least noise found by fourth differences, over that by third ones, that is noise and no motion
+            shown_there = sigma > 0 and fourth > 0.6 * sigma and guess > 0
             bound = min(sigma, guess) if sigma > 0 else guess
             found.append((max(sigma, step) if shown_there else bound, shown_there))
         return tuple(found)

@@ -18,7 +18,7 @@ from hybrid_mpc.check.prior import Report, check_prior
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.data.excitation import check_excitation, short_runs
-from hybrid_mpc.data.recording import COARSE, check_unit
+from hybrid_mpc.data.recording import COARSE, check_unit, count_problems
 from hybrid_mpc.errors import InputError, named_extra, no_exit, refuse
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.simulation import flow_slope, required_substeps, rest_of
@@ -47,14 +47,10 @@ QUIET = 1e-4
 """Process noise per period of the trial observer, over the states' sizes: small, as for a good prior."""
 STARTS = 32
 """Starts of the search for equilibria."""
-FEW = 6
-"""Most equilibria that are listed; more are usually a continuum."""
 REACHED = 0.01
 """Largest deviation of a state from a set-point that counts as held, over the state's size."""
 ANSWER = 10
 """Periods of the plant's response to a step of an input that is compared with the prior's."""
-AGAINST = -0.3
-"""Cosine between the responses of plant and prior below which they have different directions."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +191,8 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
         return None, None
     modes = np.linalg.eigvals(flow_slope(prior.equations.xdot)(x, u, w, prior.p).full()).astype(np.complex128)
     found = _equilibria(prior, model, x, u)
-    if prior.operating_point is None and 1 < len(found) <= FEW:
+    # most equilibria that are listed; more are usually a continuum
+    if prior.operating_point is None and 1 < len(found) <= 6:
         told = "; ".join(f"x = {(p.x.round(6) + 0.0).tolist()} ({p.stability})" for p in found)
         report.warn(
             f"prior: several equilibria under u = {u.tolist()}: {told}. Give the one at which the machine works: "
@@ -309,18 +306,15 @@ def _each_once(found: Sequence[str], known: Sequence[str]) -> list[str]:
 def _check_columns(report: Report, scenario: Scenario, prior: Prior) -> None:
     """Check that there is one column per signal, in a convertible unit, and that causes name parameters."""
     spec = scenario.data
-    for what, columns, signals in (
-        ("inputs", spec.inputs, prior.inputs),
-        ("outputs", spec.outputs, prior.outputs),
-        ("disturbances", spec.disturbances, prior.disturbances),
-    ):
-        if len(columns) != len(signals):
-            report.add(
-                f"data: {len(columns)} columns of {what} {list(columns)}, but the prior has {len(signals)}: "
-                f"{[s.name for s in signals]}. Name one column per signal. [HM-CHECK-016]"
-            )
-            continue
-        for column, signal in zip(columns, signals, strict=True):
+    for problem in count_problems(spec, prior):
+        report.add(problem)
+    roles = (
+        (spec.inputs, prior.inputs),
+        (spec.outputs, prior.outputs),
+        (spec.disturbances, prior.disturbances),
+    )
+    for columns, signals in roles:
+        for column, signal in zip(columns, signals, strict=True) if len(columns) == len(signals) else ():
             with report.part("data"):
                 check_unit(spec, column, signal)
     unknown = [
@@ -485,7 +479,8 @@ def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) 
         moved = after(rest.u + steps * (np.arange(model.n_u) == j))
         own, expected = ((one - other) / sizes for one, other in zip(moved, base, strict=True))
         lengths = float(np.linalg.norm(own)), float(np.linalg.norm(expected))
-        if min(lengths) > 0 and float(own @ expected) < AGAINST * lengths[0] * lengths[1]:
+        # cosine between the responses of plant and prior below which they have different directions
+        if min(lengths) > 0 and float(own @ expected) < -0.3 * lengths[0] * lengths[1]:
             told = ", ".join(
                 f"{s.name} by {a * k:.3g} and {b * k:.3g} {s.unit}"
                 for s, a, b, k in zip(model.states, own, expected, sizes, strict=True)

@@ -30,8 +30,6 @@ BALANCE = 1e-6
 """Largest residual of a balance along the prior's own flow, over its terms; rounding is a billion times smaller."""
 SAMPLES = 64
 """Points of each line along which jumps are searched."""
-HALVINGS = 40
-"""Bisections of the piece with the largest change; the last piece is 1e-12 of the piece's length."""
 JUMP = 1e-4
 """Change over the last piece, over the change along the whole line, above which it is a jump: a slope would have to be
 ten million times steeper than the line's."""
@@ -427,10 +425,15 @@ def _check_numbers(report: Report, prior: Prior) -> bool:
         return False
 
 
+def _values(prior: Prior) -> tuple[list[ca.SX], ca.SX]:
+    """The symbols of a point, and rates and outputs there."""
+    symbols = [ca.SX.sym(key, len(prior.names_of(key))) for key in POINT]
+    return symbols, ca.vertcat(prior.equations.xdot(*symbols), prior.equations.output(*symbols))
+
+
 def _finite_at(prior: Prior, points: Points) -> NDArray[np.bool_]:
     """Where rates, outputs and their derivatives are finite ``(n,)``."""
-    symbols = [ca.SX.sym(key, len(prior.names_of(key))) for key in POINT]
-    value = ca.vertcat(prior.equations.xdot(*symbols), prior.equations.output(*symbols))
+    symbols, value = _values(prior)
     slopes = [ca.vec(ca.densify(ca.jacobian(value, symbol))) for symbol in symbols]
     found = ca.Function("parts", symbols, [ca.vertcat(value, *slopes)])(*points.columns)
     return np.asarray(np.isfinite(found.full()).all(axis=0))
@@ -511,7 +514,8 @@ def _check_smooth(what: str, f: ca.Function, prior: Prior, points: Points) -> No
         k = steps[:, :, i].argmax(axis=1)
         low, high = share[k], share[k + 1]
         first, last = values[np.arange(len(k)), k, i], values[np.arange(len(k)), k + 1, i]
-        for _ in range(HALVINGS):
+        # bisections of the piece with the largest change; the last piece is 1e-12 of the piece's length
+        for _ in range(40):
             middle = 0.5 * (low + high)
             between = along(middle[:, None])[:, 0, i]
             left = np.abs(between - first) >= np.abs(last - between)
@@ -550,8 +554,7 @@ def _check_clock(prior: Prior) -> None:
 
 def _check_effects(report: Report, prior: Prior, points: Points) -> None:
     """Check that each input acts smoothly; warn of disturbances and parameters without effect."""
-    symbols = [ca.SX.sym(key, len(prior.names_of(key))) for key in POINT]
-    value = ca.vertcat(prior.equations.xdot(*symbols), prior.equations.output(*symbols))
+    symbols, value = _values(prior)
     groups: tuple[tuple[Signal | Parameter, ...], ...] = prior.inputs, prior.disturbances, prior.parameters
     for key, symbol, signals in zip("uwp", symbols[1:], groups, strict=True):
         for one, component in zip(signals, ca.vertsplit(symbol), strict=True):

@@ -38,12 +38,8 @@ than ``COARSE_SPAN`` of them. A command jumps, or has few levels."""
 EXACT, ROUNDED = 1e-3, 1e-6
 """Bounds of the largest error of a copy over its span, which is the rounding of the file. Two sensors of one quantity
 differ by more."""
-SAMPLED = 2000
-"""Most rows by which two columns are compared first."""
 INTERIOR, LIMITED = 0.1, 0.02
 """Least shares of samples between and at the limits of a clipped copy."""
-MOST_LEVELS = 8
-"""Most integer values of a column of modes."""
 SWITCHES = 5
 """Fewest changes of a switch that show its effect."""
 LAGS = 6
@@ -62,13 +58,9 @@ LEADS = 2.0
 """Least ratio of a link to the reverse one for the first column to be the cause."""
 MOST_LINKED = 16
 """Most columns among which links are computed."""
-FOLLOWS = 0.5
-"""Least explained share of the variance of a column that follows a set-point."""
 GAIN, OFFSET = 0.25, 0.25
 """Largest deviations of a column that follows a set-point: of its gain from one, and of its mean, in standard
 deviations of the set-point."""
-ANSWERS = 0.8
-"""Least share of variance of a drive's measurement that its command explains."""
 RATE = 0.97
 """Least correlation of a column with the rate of another for it to be that rate."""
 
@@ -106,7 +98,8 @@ class Trait:
     @cached_property
     def said(self) -> Role:
         """The role by its name."""
-        few = len(self.levels) <= MOST_LEVELS and bool((self.levels == np.round(self.levels)).all())
+        # most integer values of a column of modes
+        few = len(self.levels) <= 8 and bool((self.levels == np.round(self.levels)).all())
         return role_said_by(self.full, self.unit, switches=few)
 
     @cached_property
@@ -225,7 +218,8 @@ def copy_of(one: Trait, other: Trait) -> str:
     x, y = x[known], y[known]
     if len(x) < FEWEST_ROWS:
         return ""
-    few = slice(None, None, max(1, len(x) // SAMPLED))
+    # most rows by which two columns are compared first
+    few = slice(None, None, max(1, len(x) // 2000))
     return _copy(x, y) if _copy(x[few], y[few]) else ""
 
 
@@ -426,7 +420,8 @@ class _Judge:
             return False
         pairs = [_shifted(command, answer, lag) for lag in range(LAGS + 1)]
         shares = [_line(x, y)[2] for x, y in pairs if len(x) >= FEWEST_ROWS]
-        return max(shares, default=0.0) >= ANSWERS
+        # least share of variance of a drive's measurement that its command explains
+        return max(shares, default=0.0) >= 0.8
 
     def _set_points(self) -> None:
         """Set-points: no column affects them, one follows with gain one, and the column that drives it reacts.
@@ -439,7 +434,8 @@ class _Judge:
         for goal in [t for t in self.open if t.whole]:
             reached = [t for t in [*self.open, *self.of("output")] if t is not goal]
             best = max(reached, key=lambda t: follows(goal, t), default=None)
-            if best is None or follows(goal, best) < FOLLOWS:
+            # least explained share of the variance of a column that follows a set-point
+            if best is None or follows(goal, best) < 0.5:
                 continue
             link = self.links.of(goal, best)
             if link < ACTS or self.links.into(goal, others) * LEADS > link:

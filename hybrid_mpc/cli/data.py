@@ -135,7 +135,8 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
         "| column | unit | meaning |", "| --- | --- | --- |",
         *([f"| {markdown(spec.time)} | s | {stamp} |"] if isinstance(spec.time, str) else []),
         *(
-            f"| {markdown(column)} | {markdown(s.unit)} | {_meaning(column in spec.inputs)} {markdown(s.name)} |"
+            f"| {markdown(column)} | {markdown(s.unit)} | "
+            f"{'input, held until the next row:' if column in spec.inputs else 'measured output:'} {markdown(s.name)} |"
             for column, s in signals
         ),
         "",
@@ -150,10 +151,6 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
         *(f"| {markdown(path.name)} | {_role(scenario, path)} |" for path in files), "",
     ]  # fmt: skip
     return "\n".join(lines)
-
-
-def _meaning(is_input: bool) -> str:
-    return "input, held until the next row:" if is_input else "measured output:"
 
 
 def _role(scenario: Scenario, path: Path) -> str:

@@ -22,8 +22,6 @@ BLOCKS = 9
 alarms an hour, eight loops for one."""
 FEWEST, MOST = 4, 16
 """Smallest and largest number of loops; in between, one loop for each seed of the budget."""
-FIRST_SEED = 500
-"""First seed of these loops; compared loops have smaller seeds."""
 SMALLEST = 0.6
 """The reference of each round is scaled by a random factor from here to 1, so rounds differ."""
 AGEING, DRIFT_S = (1.0, 1.1, 0.9), 30.0
@@ -31,8 +29,6 @@ AGEING, DRIFT_S = (1.0, 1.1, 0.9), 30.0
 must not alarm because of such ageing."""
 WEAKER = 0.8
 """Remaining share of the force of a weakened actuator."""
-LOAD_SHARE = 0.2
-"""Unknown load, as a share of half the input's range."""
 
 
 def nominal_tasks(scenario: Scenario) -> list[Task]:
@@ -73,7 +69,8 @@ def nominal_loops(
     blocks = BLOCKS * max(round(block_seconds(model.dt, unit) / model.dt), 1)
     seconds, found = (settling_samples(model) + blocks) * model.dt, []
     for i in range(min(max(budget.seeds, FEWEST), MOST)):
-        task, friction, seed = tasks[i % len(tasks)], ages[i % len(ages)], FIRST_SEED + i
+        # first seed of these loops; compared loops have smaller seeds
+        task, friction, seed = tasks[i % len(tasks)], ages[i % len(ages)], 500 + i
         drift = Fault(0.0, math.inf, "plant_friction", friction, ramp=DRIFT_S * unit)
         shares = np.random.default_rng([run_seed, seed]).uniform(
             SMALLEST, 1.0, math.ceil(seconds / task.duration)
@@ -160,4 +157,5 @@ def unknown_load(control: OCP) -> float:
         >>> unknown_load(OCP(9, [1.0], [1.0] * 2, [1.0] * 2, u_min=[-5.0, -1.0], u_max=[0.0, 1.0]))
         0.5
     """
-    return LOAD_SHARE * float(0.5 * control.input_range[0])
+    # unknown load, as a share of half the input's range
+    return 0.2 * float(0.5 * control.input_range[0])

@@ -16,8 +16,6 @@ FEWEST = 6
 six seeds at 95 %: such a look would decide little, but spend its part of the 5 %."""
 LEVEL = 0.95
 """Probability that the intervals of all looks contain the ratio."""
-MOST_LOG = 100.0
-"""Largest half width of an interval of logarithms; a wider one says nothing, and its ends overflow."""
 SAME = 0.02
 """Ratios within 2 % of 1 count as the same cost: a smaller difference does not matter in practice."""
 
@@ -154,6 +152,7 @@ def compare_costs(costs: Sequence[float], base: Sequence[float], most: int) -> C
     if n == 1:
         return Comparison(ratio, None, None, n, "one seed has no interval")
     half = float(student.ppf(0.5 + level_at(n, most) / 2, n - 1) * logs.std(ddof=1) / math.sqrt(n))
-    if half > MOST_LOG:
+    # largest half width of an interval of logarithms; a wider one says nothing, and its ends overflow
+    if half > 100.0:
         return Comparison(ratio, None, None, n, "the ratios scatter too much for an interval")
     return Comparison(ratio, ratio * math.exp(-half), ratio * math.exp(half), n)

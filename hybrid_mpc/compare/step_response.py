@@ -16,8 +16,6 @@ Array = NDArray[np.float64]
 AT_REST = 0.2
 """Last share of a loop over which the set-point must be constant, and over which the offset is averaged. Before a step,
 the set-point must be constant for this share of the time after the step."""
-SETTLED = 0.05
-"""Share of a step within which a signal has settled."""
 RISE = (0.1, 0.9)
 """Shares of a step between which the rise time is measured, as in python-control's ``step_info``."""
 CLEAR = 10.0
@@ -26,8 +24,6 @@ LARGEST = 0.5
 """Smallest size of a step, as a share of the largest deviation after it: else a load moves the signal."""
 STILL = 1e-9
 """Relative change of a reference that counts as rounding."""
-JUMP = 0.5
-"""Smallest share of a step that the reference must make within one period; a slow ramp has no rise time."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +79,16 @@ def step_response(t: ArrayLike, values: ArrayLike, reference: ArrayLike) -> Step
     since = int(np.searchsorted(t, t[begin] - AT_REST * (t[-1] - t[begin])))
     before = r[max(0, min(since, begin - 2)) : begin]
     stood = not begin or np.ptp(before) <= STILL * scale
-    if abs(size) <= least or jump < JUMP * abs(size) or not stood:
+    # smallest share of a step that the reference must make within one period; a slow ramp has no rise time
+    if abs(size) <= least or jump < 0.5 * abs(size) or not stood:
         return StepResponse(offset)
     answer = (y[begin:] - y[begin]) * np.sign(size)
     if np.max(answer) < RISE[1] * abs(size):  # the signal never reaches 90 % of the step
         return StepResponse(offset, overshoot=0.0)
     share, times = answer / abs(size), t[begin:] - t[begin]
     low, high = (int(np.argmax(share >= level)) for level in RISE)
-    outside = np.flatnonzero(np.abs(share - 1.0) >= SETTLED)
+    # share of a step within which a signal has settled
+    outside = np.flatnonzero(np.abs(share - 1.0) >= 0.05)
     settled = int(outside[-1]) + 1 if outside.size else 0
     return StepResponse(
         offset,

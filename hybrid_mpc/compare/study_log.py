@@ -36,8 +36,6 @@ MOST_LINE = 2**24
 """Largest row [bytes]: figures of a run, or traceback of a failed run."""
 SEGMENT_ROWS = 10_000
 """Rows of one file of the log; a study of a million runs has a hundred files."""
-GROUP_ROWS = 20_000
-"""Largest number of rows in memory."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +233,8 @@ def compact(log: Path, path: Path, provenance: Mapping[str, Any]) -> None:
     schema = schema.with_metadata({METADATA: json.dumps(plain(provenance)).encode()})
     final = (row.plain() for i, row in enumerate(rows(log)) if last[row.id] == i)
     with replacing(path) as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
-        while group := list(islice(final, GROUP_ROWS)):
+        # largest number of rows in memory
+        while group := list(islice(final, 20_000)):
             for values in group:
                 values |= {
                     k: make(values[k]) for k, (_, make) in columns.items() if values.get(k) is not None

@@ -67,8 +67,6 @@ BATCHES_A_SECOND = 50.0
 BATCH_MOST = 500
 AHEAD = 2
 """Batches for each worker: one in progress, and one waiting."""
-TRIES = 3
-"""Number of dead workers after which a run counts as failed."""
 THREADS = 1
 """Threads of the numerical libraries in each process: runs are small, and all cores are used by processes."""
 PROBE_PERIODS = 20
@@ -444,7 +442,8 @@ class _Suspects:
         for config in batch:
             alone = self.alone is not None and config.id == self.alone.id
             tries = self._tries[config.id] = self._tries.get(config.id, 0) + 1
-            if not alone or (tries < TRIES and not lost.final):
+            # number of dead workers after which a run counts as failed
+            if not alone or (tries < 3 and not lost.final):
                 self.left.append(config)
                 continue
             error = f"its worker died {tries} times ({lost}): out of memory, or a crash outside Python"

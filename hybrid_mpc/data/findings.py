@@ -39,23 +39,19 @@ _CODE = re.compile(
 _NEVER = re.compile(r"9999+(\.9+|\.25)?|999\.25|9\.9.*e\+\d\d+|[13].*e\+[2-9]\d")
 """Codes that are no position of a switch, if they are negative or larger than ``LARGER``."""
 LARGER = 1e15  # largest number of a machine that switches
-SEVERAL = 4  # most codes that are looked for in one column
 OUTLYING = 10.0  # least distance of an outlier from all other values, in spans of these
-MOST_ODD = 5  # most outliers of a column, and at most one sample in a hundred: more are a motion
 
 # Jumps
 NEARLY = 0.25
 """Largest deviation of a jump from a full turn, in turns: the angle itself moves less than this between samples."""
 SPAN = 1.05
 """Largest span of a wrapped angle in turns: one turn and some noise. An unwrapped angle usually spans more."""
-HOLE = 1.5  # time step, in median steps, above which samples are missing between two stamps
 UNSURE = 0.4
 """Largest deviation, in turns, of the way over missing samples from the way at the speeds before and after. At half a
 turn another number of turns would fit equally well."""
 PARTS = (2, 3, 4, 6, 8)
 """Fractions of a turn at which a sensor may restart: half turns of an arctangent, pole pairs."""
 BITS = (8, 10, 12, 14, 16, 20, 24, 32)  # of counters that overflow
-LIKE = 0.03  # largest relative deviation of a jump, the motion around it subtracted, from such a fraction
 
 # Stuck sensors
 SHORTEST = 5  # fewest equal consecutive samples of a stuck sensor; fewer are a lost telegram
@@ -204,7 +200,8 @@ def missing_code(column: Array) -> float | None:
     largest size or negative where all others are not.
     """
     others, found = column[np.abs(column) <= ABSURD], list[float]()
-    while len(others) and len(found) < SEVERAL:
+    # most codes that are looked for in one column
+    while len(others) and len(found) < 4:
         ends = (float(others.min()), float(others.max()))
         code = next((end for end in ends if _spelled(_CODE, end)), None)
         if code is None:
@@ -231,7 +228,8 @@ def _spelled(pattern: re.Pattern[str], value: float) -> bool:
 def outliers(column: Array) -> Indices | None:
     """The few samples that are away from all others by ``OUTLYING`` times their span; None without any."""
     known = np.abs(column) <= ABSURD
-    others, most = np.sort(column[known]), max(1, min(MOST_ODD, int(0.01 * known.sum())))
+    # most outliers of a column, and at most one sample in a hundred: more are a motion
+    others, most = np.sort(column[known]), max(1, min(5, int(0.01 * known.sum())))
     best, count = None, len(others)
     for low, high in product(range(most + 1), repeat=2):
         rest = others[low : count - high]
@@ -274,7 +272,8 @@ def unwrap(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: boo
         return Unwrapped(angle, none, none)
     turns = np.where(near, -np.round(step / turn), 0.0)
     span, moved = np.diff(t), step + turn * turns
-    regular = near & (span <= HOLE * float(np.median(span)))
+    # time step, in median steps, above which samples are missing between two stamps
+    regular = near & (span <= 1.5 * float(np.median(span)))
     speed = np.where(regular, moved / span, np.nan)
     fastest, known, unclear = float(np.nanmax(np.abs(speed), initial=0.0)), np.flatnonzero(regular), []
     for k in np.flatnonzero(near & ~regular & (fastest * span > 0.5 * turn)):
@@ -314,7 +313,8 @@ def _find_restarts(
         return None
     jumps = np.abs(jump[on] - (before[on] + after[on]) / 2)
     for k, size in enumerate(sizes):
-        if (np.abs(jumps - size) <= LIKE * size).all() and span <= most * size:
+        # largest relative deviation of a jump, the motion around it subtracted, from such a fraction
+        if (np.abs(jumps - size) <= 0.03 * size).all() and span <= most * size:
             return k, inner[on] + 1
     return None
 

@@ -26,7 +26,6 @@ from hybrid_mpc.records import shown
 from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
-MOST_FIELDS = 64  # longest array in a message that is read as signals
 NUMBERS = {"2": (0, 1, 2, 6, 7, 8, 9, 65535), "3": (0, 1, 2, 6, 7, 8, 9, 65535), "4": (0, 1, 2, 4, 5, 6)}
 """Conversions of raw to physical numbers that are used, by the version of an MDF file; tables of texts are not."""
 FORMULAS = {"2": 10, "3": 10, "4": 3}  # the conversion that is a formula in a text
@@ -202,7 +201,8 @@ def _fields_of(value: Any, name: str) -> Iterator[tuple[str, float]]:
         for key, inner in value.items():
             yield from _fields_of(inner, f"{name}.{key}" if name else str(key))
     elif isinstance(value, list | tuple | np.ndarray):
-        if len(value) <= MOST_FIELDS:
+        # longest array in a message that is read as signals
+        if len(value) <= 64:
             for k, inner in enumerate(value):
                 yield from _fields_of(inner, f"{name}[{k}]")
     elif hasattr(value, "__slots__"):

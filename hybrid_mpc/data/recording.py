@@ -35,15 +35,12 @@ PROPOSED = (  # units that are proposed for a column outside its signal's range
     "km/h", "mN m", "N cm", "N mm", "kN m", "mN", "kN", "mV", "kV", "mA", "Pa", "kPa", "mbar", "bar", "g", "kg", "mW",
     "kW", "K", "degC", "degF", "%", "-", "l/min", "l/s", "m^3/h",
 )  # fmt: skip
-FILLED = 0.01  # least share of a signal's range that a column fills in a proposed unit
 SHARE = 0.05  # least share of samples outside the range: a wrong unit affects all rows
 BEYOND = 4.0  # least ratio of a column's largest value to the range's limit: below, the range may be wrong
 DIGITS = 1e-9  # relative deviation of equal numbers in files of different formats: ten digits
 ALIKE = 0.8  # least similarity of two recording names that differ by a typo
 FEWEST = 10  # fewest time stamps that show whether the sampling is uniform
 UNEVEN = 1e-3  # relative deviation above which two steps differ
-PAUSE = 20.0  # time step, in median steps, above which the recording pauses
-SLACK = 0.05  # allowed deviation of a fitted grid beyond the rounding of the stamps, in roundings
 COARSE = 1.5  # largest sampling period in model periods: beyond it, interpolation would invent samples
 ROUNDING = 1e-9  # relative distance from an end of a sensor's range within which a sample is at that end
 TIME = Signal("time", "s")
@@ -142,7 +139,7 @@ def read_recordings(
 
     Recordings may differ in format, length, sampling, and in columns that ``spec`` does not name.
     """
-    refuse(_count_problems(spec, prior) or _name_problems(spec, [*map(Path, paths)]))
+    refuse(count_problems(spec, prior) or _name_problems(spec, [*map(Path, paths)]))
     recordings: list[Recording] = []
     problems: list[str] = []
     there: dict[str, list[str]] = {}
@@ -194,7 +191,7 @@ def _alike(one: Recording, other: Recording) -> bool:
 # The specification
 
 
-def _count_problems(spec: DataSpec, prior: Signals) -> list[str]:
+def count_problems(spec: DataSpec, prior: Signals) -> list[str]:
     """Roles whose number of columns differs from the prior's number of signals."""
     roles: list[tuple[str, str, Sequence[str], Sequence[Signal]]] = [
         ("inputs", "input", spec.inputs, prior.inputs),
@@ -206,7 +203,7 @@ def _count_problems(spec: DataSpec, prior: Signals) -> list[str]:
         f"data specification: {role} has {counted(len(names), 'column')} "
         f"({', '.join(map(repr, names)) or 'none'}) for a prior with {len(signals)} {word}"
         f"{'s' * (len(signals) != 1)} ({', '.join(s.label for s in signals) or 'none'}). Name one column per signal, "
-        "in the prior's order."
+        "in the prior's order. [HM-DATA-129]"
         for role, word, names, signals in roles
         if len(names) != len(signals)
     ]
@@ -482,7 +479,8 @@ def make_even(t: Array) -> Array:
     if float(np.abs(steps - usual).max()) <= UNEVEN * usual:
         return t
     found, rounding = t.copy(), _rounding(t)
-    for rows in np.split(np.arange(len(t)), np.flatnonzero(steps > PAUSE * usual) + 1):
+    # time step, in median steps, above which the recording pauses
+    for rows in np.split(np.arange(len(t)), np.flatnonzero(steps > 20.0 * usual) + 1):
         if len(rows) < FEWEST:
             continue
         own = t[rows] - t[rows[0]]
@@ -491,7 +489,8 @@ def make_even(t: Array) -> Array:
         slope = float(np.cov(count, own)[0, 1] / np.var(count, ddof=1)) if np.ptp(count) > 0 else 0.0
         grid = own.mean() + slope * (count - count.mean())
         off = np.abs(grid - own)
-        fits = (np.diff(count) > 0).all() and (off <= rounding[rows] * (0.5 + SLACK)).all()
+        # allowed deviation of a fitted grid beyond the rounding of the stamps, in roundings
+        fits = (np.diff(count) > 0).all() and (off <= rounding[rows] * (0.5 + 0.05)).all()
         if fits and off.max() > UNEVEN * slope:
             found[rows] = t[rows[0]] + grid
     return found
@@ -587,6 +586,7 @@ def _likely_unit(column: Array, signal: Signal) -> str:
             continue
         values = found.factor * column + found.offset
         low, high = float(values.min()), float(values.max())
-        if max(-low, high) >= FILLED * limit and signal.lower <= low and high <= signal.upper:
+        # least share of a signal's range that a column fills in a proposed unit
+        if max(-low, high) >= 0.01 * limit and signal.lower <= low and high <= signal.upper:
             return unit
     return ""

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 UNPACKED = 50  # largest ratio of unpacked bytes of a workbook to bytes of its file
 MOST_CELLS = 20_000_000  # most cells of a sheet: each takes a hundred bytes of memory
-LONGER = 10  # rows of the sheet that is read, over those of any other sheet with a table
 
 
 def excel_source(path: Path, content: bytes, sha256: str) -> Source:
@@ -53,7 +52,8 @@ def excel_source(path: Path, content: bytes, sha256: str) -> Source:
         raise InputError(
             f"{path}: no sheet has a table of numbers. Save the table alone, with a header above it. [HM-DATA-077]"
         )
-    if len(order) > 1 and found[order[0]][0] < LONGER * found[order[1]][0]:
+    # rows of the sheet that is read, over those of any other sheet with a table
+    if len(order) > 1 and found[order[0]][0] < 10 * found[order[1]][0]:
         raise InputError(
             f"{path}: {len(order)} sheets have tables ({', '.join(map(shown, order[:LISTED]))}). Save the sheet "
             "to read in a workbook of its own. [HM-DATA-078]"

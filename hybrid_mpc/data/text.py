@@ -30,9 +30,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "vertical bars", " ": "blanks"}
 SAMPLE = 2**17  # bytes at the beginning of a text in which the table is searched
-CLOSING = 50  # most rows behind a table (means, sums, a remark) that are removed
-TAIL = 200  # rows before the last one whose decimals are compared with those of the last row
-CUT = 3.0  # step of the last number over a column's largest step, above which the number may be cut in two
 BLANKS = sorted({form(cell) for cell in BLANK for form in (str, str.upper, str.capitalize)} | {"NaN"})
 UNCLOSED = (
     "a quotation mark is not closed, so the rows after it form one cell. Delete the mark, or double it within "
@@ -177,7 +174,8 @@ class _Rows:
             notes.append(f"rows of remarks are left out, the first is row {self.numbers[np.argmax(remarks)]}")
         top = self.cells(layout.first) if keep.any() else []
         values, closing = [j for j, cell in enumerate(top) if is_value(cell)], 0
-        for k in np.flatnonzero(keep)[::-1][:CLOSING].tolist():
+        # most rows behind a table (means, sums, a remark) that are removed
+        for k in np.flatnonzero(keep)[::-1][:50].tolist():
             cells = self.cells(k)
             begin = next((j for j, cell in enumerate(cells) if cell), 0)
             name = cells[begin] if cells else ""
@@ -254,7 +252,8 @@ def _frame(rows: _Rows, layout: Layout, done: list[str]) -> Frame:
         if unsure and (found := _grouped(columns([j])[0], unsure, decimal, numbers)):
             return found
         last = not rows.text.endswith(b"\n") and seen[j] == len(names) - 1 and len(values) > 4
-        before = [text(k, j) for k in range(max(0, count - TAIL), count)] if last else []
+        # rows before the last one whose decimals are compared with those of the last row
+        before = [text(k, j) for k in range(max(0, count - 200), count)] if last else []
         if last and _is_cut(before, values):
             return (
                 f"row {numbers[-1]}, COLUMN is {shown(before[-1])}: the file ends within this row, so the number "
@@ -360,7 +359,8 @@ def _is_cut(cells: Sequence[str], values: Array) -> bool:
         return False
     with np.errstate(over="ignore", invalid="ignore"):  # an overflow is reported as out of range
         steps = np.abs(np.diff(values))
-    jumps = bool(steps[-1] > CUT * float(np.nanmax(steps[:-1], initial=0.0)))
+    # step of the last number over a column's largest step, above which the number may be cut in two
+    jumps = bool(steps[-1] > 3.0 * float(np.nanmax(steps[:-1], initial=0.0)))
     decimals = [len(re.split("[.,]", cell)[-1]) if re.search("[.,]", cell) else 0 for cell in cells]
     fewer = len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
     return fewer or (jumps and len(cells[-1]) < len(cells[-2]))

@@ -24,8 +24,6 @@ ROLES: tuple[Role, ...] = ("train", "valid", "test")
 TINY = 1e-6  # tolerance [periods] in counts of periods: above rounding
 NEAR = 5e-5  # tolerance [periods] between time stamps, which files round: 1 us at 20 ms
 FINEST = 1000  # most samples of the model's grid per recorded sample: beyond it a unit is wrong
-UNEVEN = 20.0  # largest ratio of mean to median sampling period: smoothing assumes the median
-WORK = 2e10  # most multiplications of smoothing, samples times samples in a window: half a minute
 
 
 @dataclass(frozen=True)
@@ -284,12 +282,14 @@ def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
     """Refuse sampling that is too uneven, too coarse for the period, or too fine to smooth over ``samples``."""
     steps = np.diff(recording.t)
     mean = float(steps[~gaps(recording.t, spec.max_gap)].mean())  # gaps left out
-    if samples and mean > UNEVEN * recording.dt:
+    # largest ratio of mean to median sampling period: smoothing assumes the median
+    if samples and mean > 20.0 * recording.dt:
         raise InputError(
             f"sampling is uneven: the median step of the time stamps is {recording.dt:.3g} s, the mean step {mean:.3g} "
             "s. Record at a constant rate, or check the time stamps. [HM-DATA-101]"
         )
-    if samples * len(recording.t) * mean / recording.dt > WORK:
+    # most multiplications of smoothing, samples times samples in a window: half a minute
+    if samples * len(recording.t) * mean / recording.dt > 2e10:
         raise InputError(
             f"smoothing of {spec.smoothing:g} s covers {samples} of {len(recording.t)} samples, too many to compute. "
             f"The model's period is {spec.dt:g} s: keep every tenth or hundredth row, or split the recording. "

@@ -153,7 +153,6 @@ def _uniform(path: Path, name: str, dt: float, m: int) -> Array:
 # Variables, fields and datasets
 
 
-MOST_WIDE = 64  # most columns of a matrix that are read as signals
 MOST_STRUCTS = 100  # most elements of an array of structs or cells that are read
 OBJECTS = "objects"
 CONVERT = {  # MATLAB code that converts an object to vectors, by its class
@@ -211,7 +210,8 @@ def leaf_source(
 def _columns_of(leaf: Leaf) -> dict[str, Callable[[], NDArray[Any]]]:
     """A vector, or the columns of a matrix (its rows, if they are longer)."""
     long = [size for size in leaf.shape if size != 1]
-    if len(leaf.shape) != 2 or len(long) < 2 or min(long) > MOST_WIDE or 0 in long:
+    # most columns of a matrix that are read as signals
+    if len(leaf.shape) != 2 or len(long) < 2 or min(long) > 64 or 0 in long:
         return {leaf.name: leaf.read}
     upright = leaf.shape[0] >= leaf.shape[1]
     form = "(:,{})" if upright else "({},:)"

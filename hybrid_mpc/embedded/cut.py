@@ -15,8 +15,6 @@ from hybrid_mpc.model.model import HybridModel, inlined
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
-MOST_SCALARS = 10_000
-"""Maximum scalar operations before or behind a GRU cell; with more, all networks are exported as layers."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,8 @@ def _gru(model: HybridModel, of: str, point: list[ca.MX], z_next: ca.MX, call: c
         _scalar(model, of, [*point, units], behind),
     )  # fmt: skip
     parts = (found.before, found.after)
-    if max(f.n_instructions() for f in parts if f is not None) > MOST_SCALARS:
+    # maximum scalar operations before or behind a GRU cell; with more, all networks are exported as layers
+    if max(f.n_instructions() for f in parts if f is not None) > 10_000:
         return None
     kept = of == "xdot" or _kept(model, found)
     return found if kept else None

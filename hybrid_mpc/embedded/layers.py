@@ -16,8 +16,6 @@ from hybrid_mpc.errors import InputError
 from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
-FEW = 4
-"""Maximum number of derivatives of an element of a layer's argument that are multiplied one by one."""
 
 
 Entry = tuple[int, int, ca.SX]
@@ -219,7 +217,8 @@ def layer_code(
             count += len(chosen)
             for r, *_ in chosen:
                 pattern[r, [where[c] for c in owners[k][3]]] = True
-        full = np.flatnonzero(pattern.sum(axis=1) > FEW)
+        # maximum number of derivatives of an element of a layer's argument that are multiplied one by one
+        full = np.flatnonzero(pattern.sum(axis=1) > 4)
         pattern[full] = False
         rest = np.argwhere(pattern)
         texts += [

@@ -24,10 +24,6 @@ from hybrid_mpc.kit.prediction import SHARE, Bands
 Array = NDArray[np.float64]
 Pair: TypeAlias = tuple[Array, Array]
 """Errors of an output in a run ``(n,)``, and the parts of their variance ``(n, m)``."""
-KNOWN = 8
-"""Minimum number of independent errors that the validation runs stand for; beyond it, each run counts as one."""
-LEAST = 1e-6
-"""Minimum of a variance over the mean square, so that it is never zero."""
 FOLDS = 5
 """Groups of validation runs of the cross-validation that decides whether a band's width varies."""
 FAR = 1e3
@@ -202,7 +198,8 @@ def _weights(pairs: Sequence[Pair]) -> Array:
 
     def cost(logs: Array) -> tuple[float, Array]:
         own = np.exp(logs) * known
-        variance = np.maximum(scaled @ own, LEAST)
+        # minimum of a variance over the mean square, so that it is never zero
+        variance = np.maximum(scaled @ own, 1e-6)
         ratio = squares / level / variance
         slope = scaled.T @ ((1.0 - ratio) / variance) * own
         return float(np.mean(np.log(variance) + ratio)), slope / len(squares)
@@ -217,4 +214,5 @@ def _quantile(ratios: Array, weights: Array, share: float, runs: int) -> float:
     order, tail = np.argsort(ratios), 0.5 * (1 + share)
     total = np.cumsum(weights[order]) / float(weights.sum())
     own = float(ratios[order][min(int(np.searchsorted(total, share)), len(order) - 1)])
-    return own * float(student.ppf(tail, max(runs, KNOWN)) / norm.ppf(tail))
+    # minimum number of independent errors that the validation runs stand for; beyond it, each run counts as one
+    return own * float(student.ppf(tail, max(runs, 8)) / norm.ppf(tail))

@@ -29,8 +29,6 @@ from hybrid_mpc.machine.prior import Equations
 from hybrid_mpc.model.riccati import dare
 
 Array = NDArray[np.float64]
-PREDICTION_STEPS = 12
-"""Maximum Gauss-Newton steps of a fit of predictions, which starts near the optimum."""
 GAIN = 1e3
 """Bound of an element of the observer's gain [sizes of a state per spread of an output]."""
 QUIETLY = 0.01
@@ -159,7 +157,8 @@ def fit_by_prediction(fit: OutputFit, theta: Array, windows: OutputWindows, smoo
     """
     n, own = len(fit.free), PredictionFit(fit, smoother)
     first = np.concatenate([theta[:n], own.nominal[n:]])
-    found = Shooting(own, own.of(windows), own.sizes).solve(first, PREDICTION_STEPS)
+    # maximum Gauss-Newton steps of a fit of predictions, which starts near the optimum
+    found = Shooting(own, own.of(windows), own.sizes).solve(first, 12)
     covariance = np.zeros((len(theta), len(theta)))
     covariance[:n, :n] = found.covariance[:n, :n]
     known = tuple(one for one in found.unidentified if set(one.parameters) <= set(fit.names))

@@ -69,7 +69,10 @@ STEPS = 8
 ITERATIONS = 12
 """Gauss-Newton steps of a fit that starts near the optimum."""
 WORTH = 0.95
-"""Ratio of errors that a term must fall below: a smaller reduction is not worth a parameter."""
+"""Ratio of errors that a term must fall below to be needed beside another one, or an alternative to it."""
+ADDED = 0.85
+"""Ratio of errors that a term must fall below to be added. Smaller held-out gains became harm on another recording as
+often as gain (docs/results/explain.md), and a term costs its reader attention."""
 HARM = 1.05
 """Ratio of errors above which a term is harmful."""
 GAIN = 0.7
@@ -798,8 +801,8 @@ class _Explain:
         reason = ""
         if not np.isfinite(squares).all():
             return _Fitted(forms, None, theta, squares, "its free runs diverge")
-        if found.ratio >= WORTH or squares.sum() >= self.now.squares.sum():
-            less = "" if found.ratio >= WORTH else ", but the error over all samples is not smaller"
+        if found.ratio >= ADDED or squares.sum() >= self.now.squares.sum():
+            less = "" if found.ratio >= ADDED else ", but the error over all samples is not smaller"
             reason = f"the ratio to the model without it is {found.ratio:.2f}{less}"
         elif found.upper >= 1.0:
             more = self.evidence.needed(squares, self.now.squares, candidates)

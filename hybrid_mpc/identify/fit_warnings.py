@@ -18,8 +18,6 @@ from hybrid_mpc.identify.windows import FEW, FirstStates, cut_outputs, most_samp
 Array = NDArray[np.float64]
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
-HARDLY = 0.98
-"""Error of a fit over that of the nominal values above which the fit is no improvement."""
 NEARLY = 0.05
 """Largest change of a parameter, and largest standard error, over its nominal value, that confirm the nominal value."""
 LATE = 4.0
@@ -30,8 +28,6 @@ which a delay of 4e-5 periods can explain."""
 TELLING = 0.9
 """Share of the training error and of the validation error below which a delay causes a warning; the delay must also be
 at least twice its standard error."""
-HOPELESS = 0.98
-"""Error after a linear step with a delay over that without, above which no delay is fitted."""
 
 
 def warnings_of(
@@ -46,7 +42,8 @@ def warnings_of(
         )
     if not len(chosen.covariance):
         return (*warnings, "no fit improved on the nominal parameters") if fit.free else ()
-    if gained > HARDLY and not _confirmed(fit, chosen):
+    # error of a fit over that of the nominal values above which the fit is no improvement
+    if gained > 0.98 and not _confirmed(fit, chosen):
         warnings.append(
             f"the fit hardly improves on the nominal parameters (its error is {gained:.3f} of theirs): either they are "
             "right, or the prior lacks an effect that no parameter describes"
@@ -88,7 +85,8 @@ def late_inputs(
         elif not problems:
             return ()
     without_delay = Shooting(fit, problems[0].windows, sizes)
-    if _share_with_delay(problems[0], theta, without_delay.first_states(theta)) > HOPELESS:
+    # error after a linear step with a delay over that without, above which no delay is fitted
+    if _share_with_delay(problems[0], theta, without_delay.first_states(theta)) > 0.98:
         return ()
     at_once = without_delay.solve(theta, START_ITERATIONS)
     found = problems[0].solve(np.append(theta, 0.5), START_ITERATIONS)

@@ -21,8 +21,6 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 AT_ONCE = 256
 """Samples whose equations are evaluated together: arrays of this length stay in a processor's cache."""
-STEPS = 60
-"""Maximum Levenberg-Marquardt steps; about a dozen are usual."""
 STILL = 1e-4
 """Decrease of the cost per sample below which the iteration has converged: each estimate would change by about 1 % of
 its standard deviation."""
@@ -161,7 +159,8 @@ class Horizon:
         found, cost = z.copy(), best.cost.copy()
         left, own, now, damping = np.arange(len(cost)), stretches, best, np.zeros(len(cost))
         patience = np.zeros(len(cost), dtype=int)
-        for _ in range(STEPS):
+        # maximum Levenberg-Marquardt steps; about a dozen are usual
+        for _ in range(60):
             lengths = np.diff([*own.begins, len(own.y)])
             step, gain = now.step(damping)
             after = _Linearized.at(self, own, np.clip(now.z + step, self.lower, self.upper), factor)

@@ -18,10 +18,6 @@ CLUSTERS = 48
 """Minimum number of parts of the windows whose scatter gives the standard errors."""
 ROUNDED = 1e-11
 """Ratio of singular values of the slopes below which they are rounding errors."""
-ALIKE_WEIGHTS = 0.8
-"""Ratio of the smallest to the largest weight above which parameters of one unit form a sum instead of a product."""
-INVOLVED = 0.2
-"""Share of the largest weight above which a parameter is a part of a combination."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,8 @@ def covariance(
 
 def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Array) -> Combination:
     """Parameters of an unidentifiable direction [half ranges], and the best known combination of these parameters."""
-    among = np.flatnonzero(np.abs(direction) > INVOLVED * np.abs(direction).max())
+    # share of the largest weight above which a parameter is a part of a combination
+    among = np.flatnonzero(np.abs(direction) > 0.2 * np.abs(direction).max())
     names = tuple(fit.names[i] for i in among)
     if len(among) == 1:
         return Combination(names)
@@ -117,7 +114,8 @@ def _combination(fit: OutputFit, theta: Array, covariance: Array, direction: Arr
     value = theta[among] * sizes
     sign = np.sign(theta[among])
     one_sign = (sign * np.where(sign > 0, fit.lower[among], fit.upper[among]) >= 0).all() and sign.all()
-    product = bool(one_sign) and not (len(units) == 1 and ratio.min() > ALIKE_WEIGHTS)
+    # ratio of the smallest to the largest weight above which parameters of one unit form a sum instead of a product
+    product = bool(one_sign) and not (len(units) == 1 and ratio.min() > 0.8)
     if product:
         weights, error = known(value)
         weights = weights * value

@@ -44,18 +44,12 @@ COMMON = 0.7
 So large errors during a part of the time, from a wrong prior, are no outliers."""
 GROSS = 10.0
 """Residual, in robust standard deviations, above which a sample is left out at the end of a fit."""
-SCALINGS = 4
-"""Maximum number of times that the scales are estimated again; outliers hide small residuals at first."""
-SETTLED = 0.8
-"""Ratio of new to old scales below which they are estimated again."""
 FAR = 3.0
 """Limit of an error, in spreads of the data, in the comparison of candidates."""
 LARGEST = 1e3
 """Limit of a residual, in spreads of the data, so that a diverging free run stays finite."""
 COMPARED = 10
 """Maximum steps of the initial states alone, in the comparison of candidates."""
-FOLLOWING = 4
-"""Maximum steps of the initial states for a new ``theta`` that would be rejected without them."""
 ALIKE = 1e-3
 """Relative decrease of a candidate's cost below which these steps end."""
 DAMPING, WORST = 1e-3, 1e9
@@ -193,9 +187,11 @@ class Shooting:
         point = self.start(theta, self.first_states(theta), "all")
         if len(theta):
             point = self._descend(point, min(iterations, FIRST))
-            for k in range(SCALINGS):
+            # maximum number of times that the scales are estimated again; outliers hide small residuals at first
+            for k in range(4):
                 rescaled = replace(point, scale=self._left(point.error), held=1.0)
-                if k and (rescaled.scale > SETTLED * point.scale).all():
+                # ratio of new to old scales below which they are estimated again
+                if k and (rescaled.scale > 0.8 * point.scale).all():
                     break
                 point = self._descend(rescaled, iterations)
             if (np.abs(point.error) > GROSS * point.scales).any():
@@ -426,7 +422,8 @@ class Shooting:
         moved = replace(trial, slopes=trial.slopes[..., -trial.x.shape[1] :])
         still = self._at(point, trial.theta, point.x, "x")
         better = self._costs(still) < self._costs(moved)
-        return self._states(moved.where(better[self.windows.group], still), FOLLOWING)
+        # maximum steps of the initial states for a new ``theta`` that would be rejected without them
+        return self._states(moved.where(better[self.windows.group], still), 4)
 
     def _descend(self, point: _Point, iterations: int, enough: float = CONVERGED) -> _Point:
         """Levenberg-Marquardt steps of ``theta`` and initial states.

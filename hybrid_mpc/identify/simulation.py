@@ -28,8 +28,6 @@ MAX_SUBSTEPS = 20
 USUALLY = 0.98
 """Share of the samples at which a prior must not be too stiff. At the others, such as near the square root of an empty
 tank's level, the integration is less accurate."""
-VISITED = 200
-"""Number of samples of the recordings at which the stiffness is computed, besides the extreme ones."""
 CHAINED = 20
 """Periods of a recursion in one call: a call from Python takes as long as some hundred operations."""
 Points: TypeAlias = tuple[Array, Array, Array]
@@ -286,7 +284,8 @@ def visited(trajectories: Sequence[Trajectory]) -> Points:
     every = np.hstack(columns)[np.isfinite(np.hstack(columns)).all(axis=1)]
     if len(every):
         outermost = {int(i) for found in (every.argmin(axis=0), every.argmax(axis=0)) for i in found}
-        every = every[sorted({*evenly(len(every), VISITED), *outermost})]
+        # number of samples of the recordings at which the stiffness is computed, besides the extreme ones
+        every = every[sorted({*evenly(len(every), 200), *outermost})]
     x, u, w = np.split(every, np.cumsum([v.shape[1] for v in columns])[:-1], axis=1)
     return x, u, w
 

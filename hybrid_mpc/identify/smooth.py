@@ -30,8 +30,6 @@ from hybrid_mpc.machine.prior import Equations, Prior
 Array = NDArray[np.float64]
 STILL = 0.01
 """Last Newton step, over the states' sizes, below which an equilibrium has converged."""
-NEWTON = 15
-"""Newton steps to the equilibrium of the first inputs."""
 DECADES = (-6.0, 2.0)
 """Searched range of the walk of the unexplained rates, as a power of ten of their natural size: from an exact prior to
 a prior that explains nothing."""
@@ -39,8 +37,6 @@ AT_ONCE, NARROW = 15, 0.1
 """Number of walks that are tried at once, and the resolution [powers of ten] at which the search ends."""
 ALIKE = 0.5
 """Minimum ratio of lengths of trajectories that run in one batch."""
-ROUGH = -0.5
-"""Walk, as a power of ten, for a prior that is not fitted yet."""
 IGNORANCE = 10.0
 """Standard deviation of an unknown initial state over its natural size; at most half its range."""
 SAMPLE = 12
@@ -271,7 +267,8 @@ class Smoother:
         rates, slopes = self.prior.equations.xdot.map(n), flow_slope(self.prior.equations.xdot).map(n)
         low, high = (np.array([getattr(s, end) for s in self.prior.states]) for end in ("lower", "upper"))
         x = np.tile(rest, (n, 1))
-        for _ in range(NEWTON):
+        # Newton steps to the equilibrium of the first inputs
+        for _ in range(15):
             xdot = rates(x.T, *held).full().T
             a = np.moveaxis(slopes(x.T, *held).full().reshape(len(rest), n, -1), 1, 0)
             good = np.isfinite(xdot).all(axis=1) & np.isfinite(a).all(axis=(1, 2))
@@ -421,7 +418,8 @@ def rough_smoother(
 
     Arguments as for :func:`fit_smoother`; there is no search.
     """
-    return _smoothers(prior, trajectories, dt, time_unit, required_substeps(prior, dt))(ROUGH, 1.0)
+    # walk, as a power of ten, for a prior that is not fitted yet
+    return _smoothers(prior, trajectories, dt, time_unit, required_substeps(prior, dt))(-0.5, 1.0)
 
 
 def _smoothers(

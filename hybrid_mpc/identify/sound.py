@@ -24,15 +24,11 @@ from hybrid_mpc.identify.windows import FEW, cut_outputs
 from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
-STUCK = 0.05
-"""Largest share of samples at the bounds of the smoothed states that can be outliers."""
 NEAR = 1e-3
 """Distance from a bound, over the range, that counts as at the bound."""
 CLEARLY = 0.75
 """Error of a linear model over the fitted prior's below which the prior lacks an effect: two models of the same
 structure, fitted to the same recordings, differ by less."""
-BOUNDED = 0.5
-"""Share of the fitted parameters at bounds from which on they compensate a missing effect."""
 NEGATIVE = -25.0
 """FIT [%] of an output below which the prior is worse than the mean of the output."""
 COSTLY = 0.95
@@ -108,7 +104,8 @@ def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) 
             continue
         near = NEAR * (high - low) if math.isfinite(high - low) else 0.0
         away = float(np.mean((x <= low + near) | (x >= high - near)))
-        if away > STUCK:
+        # largest share of samples at the bounds of the smoothed states that can be outliers
+        if away > 0.05:
             found.append(
                 f"{state.label}: at or beyond three times its range [{state.lower:g}, {state.upper:g}] in {away:.0%} "
                 f"of the smoothed samples ({x.min():.4g} to {x.max():.4g}). Either no sensor determines it, or its "
@@ -260,7 +257,8 @@ def bounds_doubt(bounds: Sequence[BoundCost], fitted: int) -> str:
         >>> bounds_doubt([BoundCost("k", 2.0, 2.6, 0.5)], 6)
         'k ends at its bound 2; with a wider one it is 2.6, and the error falls to 50 %'
     """
-    if len(bounds) > 1 and len(bounds) >= BOUNDED * fitted:
+    # share of the fitted parameters at bounds from which on they compensate a missing effect
+    if len(bounds) > 1 and len(bounds) >= 0.5 * fitted:
         ends = ", ".join(f"{one.parameter} at {one.value:.4g}" for one in bounds)
         return f"{len(bounds)} of {fitted} fitted parameters end at a bound: {ends}"
     return "; ".join(str(one) for one in bounds if one.ratio < CLEARLY)

@@ -26,8 +26,6 @@ from hybrid_mpc.machine.prior import Prior
 
 SPAN = 10
 """Periods over which the correction is averaged for its scale."""
-VARIES = 1e-3
-"""Ratio of spread to size of a signal below which the signal is scaled by its size."""
 
 
 def rk4(f: Callable[[Tensor], Tensor], x: Tensor, dt: float, substeps: int) -> Tensor:
@@ -481,7 +479,8 @@ def spread(values: Tensor) -> tuple[float, ...]:
     if not values.shape[1]:
         return ()
     deviations, sizes = values.std(0, correction=0).tolist(), values.square().mean(0).sqrt().tolist()
-    return tuple(s if s > VARIES * size else size or 1.0 for s, size in zip(deviations, sizes, strict=True))
+    # ratio of spread to size of a signal below which the signal is scaled by its size
+    return tuple(s if s > 1e-3 * size else size or 1.0 for s, size in zip(deviations, sizes, strict=True))
 
 
 PREFIX = "prior."

@@ -65,8 +65,6 @@ SMALL = 0.1
 """Size of a factor below which its term may not exist."""
 SIZE = 1.5
 """Smallest factor (or inverse factor) that shows a mistake; parameters can compensate smaller factors."""
-SHORTER = 0.7
-"""Ratio of a shorter to a longer length above which only the longer one is used."""
 NAMED, GUESSED = 0.7, 0.5
 """Ratio of the error with the corrected mistake to the error before, below which the mistake is reported: if the factor
 identifies the mistake, and if it does not.
@@ -448,7 +446,8 @@ def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[fl
     """
     tenfold = math.log(GROWN[0]) / math.log(GROWN[-1])
     shorter = max(4 * fit.dt, 2 * tenfold * min(fit.reach(theta) for theta in thetas))
-    return [shorter, longest] if shorter < SHORTER * longest else [longest]
+    # ratio of a shorter to a longer length above which only the longer one is used
+    return [shorter, longest] if shorter < 0.7 * longest else [longest]
 
 
 def named(found: Sequence[Cause]) -> str:

@@ -29,10 +29,6 @@ EXPONENTS = 0.25, 4.0
 """Bounds of the exponent of a loss; an outlet has 0.5, radiation 4."""
 STEEP = 0.9
 """Largest relative change of slope by a curve at the ends of its signal: the curve never reverses there."""
-MARGIN = 0.5
-"""How far beyond the recordings no curve of a signal without bounds may reverse, over the range of the recordings."""
-REACH = 3.0
-"""Bound of a term's weight: largest effect of the term, over the state's rate in the recordings."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +104,8 @@ class _Library:
         self, name: str, i: int, size: float, unit: str, *, positive: bool = False, words: str = ""
     ) -> Parameter:
         """Weight of a law of this size in the rate of state ``i``."""
-        most = REACH * self.rates[i] / max(size, 1e-12)
+        # bound of a term's weight: largest effect of the term, over the state's rate in the recordings
+        most = 3.0 * self.rates[i] / max(size, 1e-12)
         return Parameter(name, 0.0, unit, 0.0 if positive else -most, most, words)
 
     def _axis(self, i: int, state: Signal) -> Iterator[Candidate]:
@@ -118,7 +115,8 @@ class _Library:
         if not speed > 0:
             return
         place: Place = "force" if self.mechanical else "rate"
-        unit = _force_unit(state.unit) if self.mechanical else f"{state.unit}/s"
+        force = "N" if state.unit.startswith("m") else "N m"
+        unit = force if self.mechanical else f"{state.unit}/s"
         width = min(WIDEST * speed, max(0.5 * self.changes[i], NARROWEST * speed))
 
         def weight(
@@ -126,7 +124,7 @@ class _Library:
         ) -> Parameter:
             return self._weight(f"{key}_{own}", i, size, over(unit, *per), positive=positive, words=words)
 
-        v_unit, q_unit = state.unit, _base(state.unit)
+        v_unit, q_unit = state.unit, state.unit.removesuffix("/s")
         at: dict[str, Any] = {"width": width, "place": place}
         yield _one(laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at))
         yield _one(
@@ -409,7 +407,8 @@ def _one(term: Term) -> Candidate:
 def _ends(signal: Signal, values: Array) -> tuple[float, float]:
     """Range in which a curve must not reverse: the signal's bounds, else the recordings and a margin."""
     low, high = float(values.min()), float(values.max())
-    more = MARGIN * (high - low)
+    # how far beyond the recordings no curve of a signal without bounds may reverse, over the range of the recordings
+    more = 0.5 * (high - low)
     return (
         min(low, signal.lower) if math.isfinite(signal.lower) else low - more,
         max(high, signal.upper) if math.isfinite(signal.upper) else high + more,
@@ -439,12 +438,3 @@ def over(unit: str, *by: str) -> str:
             down.remove(word)
     words = [word for word in ups if word not in ("-", "1", "")]
     return " ".join(words or ["1"]) + "".join(f"/{word}" for word in down if word not in ("-", "1", ""))
-
-
-def _base(unit: str) -> str:
-    """Unit of a position from the unit of its speed."""
-    return unit.removesuffix("/s")
-
-
-def _force_unit(unit: str) -> str:
-    return "N" if unit.startswith("m") else "N m"

@@ -17,48 +17,79 @@ from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter, Signal
 
-AXIS, ENDS = "axes", "axes of a `MechanicalPrior` that do not turn fully"
-TURNING = "turning axes of a `MechanicalPrior`"
-OTHER = "other rates"
-INPUT, BOTH = "inputs that change", "inputs of both signs"
 GROUPS: Mapping[str, Mapping[str, str]] = {
     "Axes": {
-        "coulomb": AXIS, "asymmetric": AXIS, "viscous": AXIS, "viscous_by_direction": AXIS, "quadratic": AXIS,
-        "stribeck": AXIS, "loaded": AXIS, "coulomb_by_position": AXIS, "offset": "axes, other rates",
-        "gravity_error": TURNING, "cogging": TURNING, "spring": ENDS, "elastic_end": ENDS,
+        "coulomb": "dry friction", "asymmetric": "more dry friction forwards than backwards",
+        "viscous": "viscous friction", "viscous_by_direction": "more viscous friction forwards than backwards",
+        "quadratic": "drag, as in air", "stribeck": "more dry friction near rest",
+        "loaded": "dry friction by load of gear or bearing", "coulomb_by_position": "dry friction by position",
+        "offset": "constant force or rate", "gravity_error": "weight, its lever arm or angle",
+        "cogging": "force periodic in the position", "spring": "spring, cable, hose",
+        "elastic_end": "elastic stop",
     },
     "Processes": {
-        "loss": f"{OTHER}, not of angles", "storage": f"{OTHER}, not of angles", "radiation": "temperatures",
-        "overflow": "states that are never negative, not temperatures", "coupling": OTHER, "product": OTHER,
+        "loss": "loss to the surroundings", "storage": "second capacity, as of a wall", "radiation": "heat radiation",
+        "overflow": "overflow above an edge", "coupling": "effect of another signal",
+        "product": "effect of two signals together",
     },
     "Inputs": {
-        "input_gain": INPUT, "input_offset": INPUT, "input_curve": INPUT, "saturation": INPUT, "input_lag": INPUT,
-        "input_delay": INPUT, "gain_by_direction": BOTH, "dead_zone": BOTH,
+        "input_gain": "gain", "input_offset": "offset", "input_curve": "curved characteristic",
+        "saturation": "saturation", "input_lag": "lag of the actuator", "input_delay": "delay",
+        "gain_by_direction": "gain by sign", "dead_zone": "no effect of small inputs",
     },
     "Measured disturbances": {
-        "disturbance_gain": "disturbances that change", "disturbance_offset": "all disturbances",
-        "disturbance_lag": "disturbances that change",
+        "disturbance_gain": "gain", "disturbance_offset": "offset of the sensor", "disturbance_lag": "lag",
     },
-    "Sensors": dict.fromkeys(("output_gain", "output_offset", "output_curve", "output_lag"), "outputs that change"),
+    "Sensors": {
+        "output_gain": "gain", "output_offset": "offset", "output_curve": "curved characteristic", "output_lag": "lag",
+    },
 }  # fmt: skip
-"""Laws by kind, with the signals that each law applies to (:func:`~hybrid_mpc.identify.term_library.library`)."""
-UNITS = 3
-"""Maximum number of units of a parameter in a cell."""
+"""Effects of the laws, by the kind of signal ``of``."""
+REMARKS: Mapping[str, str] = {
+    "Axes": "`of` is the speed `v`, `q` its position. Units are those of a turning axis. For a sliding axis, read N"
+    " for N m, and m for rad.\n\n- A potential `V` acts as the force `-dV/dq`. It needs a `MechanicalPrior`.\n- `load`"
+    ' is `"driven"` (by the inputs), `"resting"` (gravity, springs) or `"both"`.\n- `turning=False`: `q - centre`'
+    " and its square replace sine and cosine.\n- `upper=False`: the stop acts below `edge`.\n- `offset` also adds to"
+    " the rate of a state that is no speed.",
+    "Processes": "`of` is a state `x`, in m or degC here.\n\n- `reference` is a number, or a state or disturbance of"
+    " the same unit.\n- `kelvin` is 273.15 for degC and 0 for K.\n- `source`, `one` and `two` name states, inputs or"
+    " disturbances.",
+    "Inputs": "`of` is an input `u`, in V here. The value of the equation acts instead of `u`.",
+    "Measured disturbances": "`of` is a measured disturbance `w`, in degC here.",
+    "Sensors": "`of` is an output `y`, in rad here.",
+}
+"""Meaning of ``of`` and of arguments in a table."""
+SYMBOLS: Mapping[str, Mapping[str, str]] = {
+    "coulomb": {"F": "level"}, "asymmetric": {"A": "more"}, "stribeck": {"F": "more"},
+    "coulomb_by_position": {"a": "one", "b": "two"}, "gravity_error": {"a": "sine", "b": "cosine"},
+    "cogging": {"a": "sine", "b": "cosine", "n": "periods"}, "spring": {"k": "stiffness"},
+    "elastic_end": {"k": "stiffness"}, "loss": {"r": "reference"},
+    "product": {"c1": "centres[0]", "c2": "centres[1]"}, "input_offset": {"offset": "value"},
+    "disturbance_offset": {"offset": "value"}, "output_offset": {"offset": "value"},
+}  # fmt: skip
+"""Arguments by the symbol of the docstring's equation, where they differ."""
 HEAD = """# Terms
 
-The laws that [`hybrid-mpc explain`](explain.md) chooses from. `--terms LAW` limits a search. `hm.terms.LAW(...)` makes
-a term for [a prior of your own](mechanical-priors.md#friction-and-other-terms).
+Physical terms for [a prior of your own](mechanical-priors.md#friction-and-other-terms).
+[`hybrid-mpc explain`](explain.md) searches the same terms; `--terms NAME` limits the search.
 
-| symbol | meaning |
+```python
+from hybrid_mpc import Parameter, terms
+
+dry = terms.coulomb("phi_dot", Parameter("F", 0.2, "N m", 0.0, 1.0), width=0.05)
+```
+
+| argument | meaning |
 | --- | --- |
-| `q`, `v` | position and its speed |
-| `x`, `u`, `w`, `y` | state, input, measured disturbance, output |
-| `s` | state of the term itself |
+| `of` | name of the signal that the term changes |
+| others without `=` | a `Parameter` each, which is fitted; the column *units* has their units |
+| with `=` | not fitted: a name, or a number in the unit of its signal |
+| `width` | range over which a switch is smooth |
+| `state` | `Signal` of the term's own state `s` |
+| `place` | of axes, but not of potentials: `place="rate"` if the prior is not mechanical |
 
-An *axis* is a pair of states, a position and its speed. *Other rates* are those of other states that a network may
-correct. A potential acts as the force `-dV/dq`. Units are examples; angles have no unit within a term.
-
-This page is generated: `python -m hybrid_mpc.identify.term_table > docs/terms.md`.
+Angles have no unit within an equation. This page is generated:
+`python -m hybrid_mpc.identify.term_table > docs/terms.md`.
 """
 
 
@@ -73,11 +104,6 @@ class _Turning(MechanicalPrior):
 
     def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
         return p.k * u.u - ca.sin(q.q)
-
-
-class _Sliding(_Turning):
-    states: ClassVar[tuple[Signal, ...]] = (Signal("q", "m", -9.0, 9.0), Signal("v", "m/s"))
-    outputs: ClassVar[tuple[Signal, ...]] = states[:1]
 
 
 class _Process(Prior):
@@ -96,58 +122,68 @@ def document() -> str:
     units, parts = _units(), [HEAD]
     for title, laws in GROUPS.items():
         parts.append(
-            f"## {title}\n\n{_tried(laws)}\n\n| law | what it is | equation | units |\n| --- | --- | --- | --- |"
+            f"## {title}\n\n{REMARKS[title]}\n\n| call | effect | equation | units |\n| --- | --- | --- | --- |"
         )
-        for law in laws:
-            cells = [f"`{law}`", terms.EXPLANATIONS[law], equation(law), "; ".join(units[law])]
+        for law, effect in laws.items():
+            cells = [f"`{call(law)}`", effect, equation(law), units[law]]
             parts.append(f"| {' | '.join(cells)} |")
         parts.append("")
     return "\n".join(parts)
 
 
-def _tried(laws: Mapping[str, str]) -> str:
-    """What the laws of a table are tried for, the most common one first."""
-    by: dict[str, list[str]] = {}
-    for law, where in laws.items():
-        by.setdefault(where, []).append(f"`{law}`")
-    common = max(by, key=lambda where: len(by[where]))
-    others = [f"{', '.join(names)} for {where}" for where, names in by.items() if where != common]
-    exceptions = f" Exceptions: {'; '.join(others)}." if others else ""
-    return f"`explain` tries these laws for {common}.{exceptions}"
+def call(law: str) -> str:
+    """Call of a law without values; an argument with ``=`` is given by name, one with a value has that default.
+
+    Example:
+        >>> call("coulomb"), call("coupling")
+        ('coulomb(of, level, width=)', 'coupling(of, k, source=, centre=0.0)')
+    """
+    given = []
+    for one in inspect.signature(getattr(terms, law)).parameters.values():
+        if one.kind != one.KEYWORD_ONLY:
+            given.append(one.name)
+        elif one.name != "place":
+            given.append(f"{one.name}={'' if one.default is one.empty else one.default}")
+    return f"{law}({', '.join(given)})"
 
 
 def equation(law: str) -> str:
-    """Equation of a law, from its docstring.
+    """Equation of a law in the names of its arguments, from its docstring.
 
     Example:
-        >>> equation("viscous_by_direction"), equation("storage")
-        ('`-a abs(v)`', "`k (s - x)` with `tau s' = x - s`")
+        >>> equation("viscous_by_direction"), equation("spring"), equation("input_lag")
+        ('`-a abs(v)`', '`V = stiffness (q - centre)^2 / 2`', "`s` with `tau s' = u - s`")
     """
     words = inspect.getdoc(getattr(terms, law)) or ""
     spans = re.findall(r"``(.*?)``", words, re.DOTALL)
     # a bar ends a cell of a table
     plain = [re.sub(r"\|([^|]+)\|", r"abs(\1)", " ".join(span.split())) for span in spans]
-    found = [f"`{span}`" for span in plain]
-    more = [span for span in found[1:2] if "s' =" in span]
-    kind = "potential " if "potential" in words.partition("``")[0] else ""
-    return kind + " with ".join([*found[:1], *more]) if found else "constant"
+    names = SYMBOLS.get(law, {})
+    found = [re.sub(r"\w+", lambda word: names.get(word[0], word[0]), span) for span in plain]
+    kind = "V = " if "potential" in words.partition("``")[0] else ""
+    if not found:
+        return "`value`"
+    more = [f"`{span}`" for span in found[1:2] if "s' =" in span]
+    lag = ["`s`"] if "s' =" in found[0] else []
+    return " with ".join([*lag, f"`{kind}{found[0]}`", *more])
 
 
-def _units() -> Mapping[str, list[str]]:
-    """Units of the parameters by law, in three examples."""
-    found: dict[str, list[str]] = {law: [] for laws in GROUPS.values() for law in laws}
+def _units() -> Mapping[str, str]:
+    """Units of the parameters by law, of the first example that has it."""
+    found: dict[str, str] = {}
     for one in _examples():
         for form in one.forms:
             assert form.made is not None
-            own = ", ".join(dict.fromkeys(p.unit for p in form.parameters))
-            if own not in found[form.made.maker]:
-                found[form.made.maker].append(own)
-    return {law: units[:UNITS] for law, units in found.items()}
+            written = ", ".join(p.unit for p in form.parameters)
+            for twice, square in (("s s/rad/rad", "s^2/rad^2"), ("/V/V", "/V^2")):
+                written = written.replace(twice, square)
+            found.setdefault(form.made.maker, written)
+    return found
 
 
 def _examples() -> Iterator[Candidate]:
     rng = np.random.default_rng(0)
-    for prior in (_Turning(), _Sliding(), _Process()):
+    for prior in (_Turning(), _Process()):
         x = rng.uniform(0.1, 2.0, (50, 2)) * (1.0 if prior.disturbances else rng.choice([-1.0, 1.0], (50, 1)))
         u = rng.uniform(0.1, 2.0, (50, 1)) * (1.0 if prior.disturbances else rng.choice([-1.0, 1.0], (50, 1)))
         yield from library(prior, (x, u, rng.uniform(10.0, 20.0, (50, len(prior.disturbances)))), 0.01, 5.0)

@@ -46,8 +46,6 @@ from hybrid_mpc.identify.step import PREFIX, HybridStep, RecurrentStep, Scaling,
 from hybrid_mpc.machine.prior import Prior
 
 Progress = Callable[[int, int, float], None]
-FIXED = 64
-"""Number of fixed windows on which the bounds are lowered."""
 REPEATS = 5
 """Number of successive skipped updates after which a network is stopped; a single batch may diverge by chance."""
 CLIP = 1.0
@@ -280,7 +278,8 @@ class TrainingRun:
         substeps = required_substeps(prior, dt, visited(training)) if own_rates else 0
         self.scaling = replace(scaling, substeps=substeps)
         self.windows, self.valid = windows.to(self.device), valid.to(self.device)
-        self.fixed = self.windows.take(torch.linspace(0, len(windows) - 1, FIXED).round().long().unique())
+        # number of fixed windows on which the bounds are lowered
+        self.fixed = self.windows.take(torch.linspace(0, len(windows) - 1, 64).round().long().unique())
         self.objectives = objectives_of(prior, s.objectives)
         self.parameters = TrainedParameters(prior, s.networks) if s.prior_parameters == "trained" else None
         replayed = bool(s.prior_replay) and s.use_prior

@@ -31,14 +31,10 @@ from hybrid_mpc.machine.prior import Prior
 Values = Mapping[str, float]
 Progress = Callable[[int, int, int, float], None]
 STUDY = "hybrid-mpc tune"
-STARTUP = 6
-"""Number of random trials before the sampler uses results."""
 FINISHED = 4
 """Minimum number of finished trainings before a training is pruned by their median."""
 PATIENCE = 0.2
 """Share of the optimizer steps without pruning, because a good setting may start slowly."""
-ENOUGH = 8
-"""Minimum number of finished trainings for an estimate of the settings' importance."""
 WHOLE = ("hidden", "batch", "horizon")
 """Settings that are whole numbers."""
 USUAL: Mapping[str, tuple[float, float]] = {
@@ -317,7 +313,8 @@ def _run_trial(
 def _ask(study: optuna.Study, number: int, base: TrainingSettings, space: SearchSpace, seed: int) -> Trial:
     """Draw the trial of a number: first the base, then from seed, number and finished trials."""
     own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-    study.sampler = optuna.samplers.TPESampler(seed=own, n_startup_trials=STARTUP)
+    # number of random trials before the sampler uses results
+    study.sampler = optuna.samplers.TPESampler(seed=own, n_startup_trials=6)
     values = space.values_of(base)
     if number == 0 and space.holds(values):
         study.enqueue_trial(values)
@@ -361,7 +358,8 @@ def _result(study: optuna.Study, base: TrainingSettings, space: SearchSpace) -> 
         )
     best = min(complete, key=lambda row: row.value)
     importance: dict[str, float] = {}
-    if len(complete) >= ENOUGH and len(space.names) > 1:
+    # minimum number of finished trainings for an estimate of the settings' importance
+    if len(complete) >= 8 and len(space.names) > 1:
         importance = dict(optuna.importance.get_param_importances(study))
     first = space.holds(space.values_of(base))
     return SearchResult(

@@ -35,8 +35,6 @@ from hybrid_mpc.machine.prior import Prior
 Array = NDArray[np.float64]
 WINDOWS_OF_EACH = 4
 """Windows of a recording at least: each has one free first state, and a single window tells little beside it."""
-MOST_WINDOWS = 48
-"""Windows of a recording at most, evenly chosen."""
 BLOCKS = 4
 """Blocks into which a single recording is cut: their scatter replaces that between recordings."""
 SHORTEST = 8
@@ -52,8 +50,6 @@ RANGE = (0.002, 1.0)
 TRIED = 14
 ITERATIONS, SETTLED = 200, 1e-3
 """Steps of the expectation-maximisation at most, and relative change of a variance that ends them."""
-UNCORRELATED = 0.05
-"""Autocorrelation of the errors below which the sum of the correlations ends."""
 USUAL = 0.05
 """Standard deviation (relative, or in half ranges) of a parameter that the user declares as varying and that the
 recordings do not identify."""
@@ -170,7 +166,8 @@ def find_varying(
     sizes = np.array(fit.smoother(of.prior, dt).sizes.x)
 
     def problem(part: Sequence[Trajectory], spread: Array | None = None) -> Shooting:
-        windows = cut_outputs(part, periods, 0, MOST_WINDOWS, of.prior.states, of.prior.outputs)
+        # windows of a recording at most, evenly chosen
+        windows = cut_outputs(part, periods, 0, 48, of.prior.states, of.prior.outputs)
         return Shooting(of, windows, sizes, spread)
 
     parts = [problem(part) for part in pieces]
@@ -224,7 +221,8 @@ def _correlation_times(errors: Sequence[Array], n_y: int) -> Array:
         e, power = every[..., j], float(np.square(every[..., j]).mean())
         for lag in range(1, samples):
             rho = float((e[:, lag:] * e[:, :-lag]).mean()) / max(power, 1e-300)
-            if rho < UNCORRELATED:
+            # autocorrelation of the errors below which the sum of the correlations ends
+            if rho < 0.05:
                 break
             found[j] += 2.0 * rho * (1.0 - lag / samples)
     return found

@@ -25,10 +25,6 @@ FEW = 24
 """Maximum number of windows for the comparison of starts, the test for a delay, and predictions."""
 LONGEST = 20_000
 """Maximum periods of a whole recording; longer ones are cut."""
-PUNCTUAL = 0.01
-"""Tolerance, in periods, of the start of a trajectory that continues another one."""
-COMPARED_SAMPLES = 1000
-"""Number of first samples that sort trajectories of equal length."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +226,8 @@ def cut_outputs(
 
 def place_among(trajectory: Trajectory) -> tuple[int, list[float]]:
     """Sort key of a trajectory: its length, then its measured samples."""
-    first = np.hstack([trajectory.y, trajectory.u])[:COMPARED_SAMPLES]
+    # number of first samples that sort trajectories of equal length
+    first = np.hstack([trajectory.y, trajectory.u])[:1000]
     return len(trajectory.t), np.nan_to_num(first, nan=-math.inf).ravel().tolist()
 
 
@@ -264,7 +261,8 @@ def continued(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
 
 def _follows(one: Trajectory, other: Trajectory) -> bool:
     """Whether the other trajectory starts one period after the end of the first, in a new file, without a jump."""
-    if one.file == other.file or not abs(float(other.t[0] - one.t[-1]) / one.dt - 1.0) < PUNCTUAL:
+    # tolerance, in periods, of the start of a trajectory that continues another one
+    if one.file == other.file or not abs(float(other.t[0] - one.t[-1]) / one.dt - 1.0) < 0.01:
         return False
     jump = np.abs(other.y[0] - one.y[-1])
     steps = np.abs(np.concatenate([np.diff(one.y, axis=0), np.diff(other.y, axis=0)]))

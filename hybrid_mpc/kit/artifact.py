@@ -78,8 +78,6 @@ INPUTS = {
 }
 RELEASED = 0.9
 """Share of a tracked parameter's limit at which its alarm ends."""
-ALMOST_PRIOR = 0.1
-"""Share of the correction with which a blend starts if the prior is recommended."""
 OWN = ("step", "xdot")
 """Functions that each single network has of its own; the others are those of the hybrid."""
 OUTPUTS = {"step": STEP_OUTPUTS, "xdot": ("xdot",), "output": ("y",), BALANCE: ("residual",)}
@@ -558,20 +556,24 @@ class Kit:
         longer fit: the loop then uses less of it, or more.
 
         Args:
-            share: Share that the observer starts with. Default: 1, the hybrid, if it is recommended; else 0.1, almost
-                the prior. At 0 it could not move.
+            share: Share that the observer starts with. Default: 1, the hybrid, if the hybrid is recommended.
             std: Standard deviation of the share. Default: 0.3, so that prior and hybrid are three deviations apart.
 
         Raises:
-            InputError: If the kit has no hybrid, or the share is not inside 0 to 2.
+            InputError: If the kit has no hybrid, the share is not inside 0 to 2, or the prior is recommended and no
+                share is given.
 
         Example:
             ``kit = hm.load("runs/mine").blended()``;
             ``loop = hm.Loop(kit.tracking_observer("hybrid"), kit.controller("hybrid", tracking=True))``
         """
         prior, hybrid = self._model("prior"), self._model("hybrid")
-        if share is None:
-            share = 1.0 if self.recommended == "hybrid" else ALMOST_PRIOR
+        if share is None and self.recommended != "hybrid":
+            raise InputError(
+                f"{self._whose}: the prior is recommended, so nothing shows that the correction helps, and a blend may "
+                "do harm (docs/results/tracking.md). Use kit.observer(), or give share= [HM-KIT-042]"
+            )
+        share = BLEND_SHARE.value if share is None else share
         if not 0.0 < share < BLEND_SHARE.upper:
             raise InputError(f"share: must be between 0 and {BLEND_SHARE.upper:g}, got {share} [HM-KIT-041]")
         models = {"prior": with_share(prior, share), "hybrid": blended(prior, hybrid, share)}

@@ -567,9 +567,9 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
             f"adaptive guard: model {model.name} has delayed inputs, which it does not support. Use guard rest or prior"
             " [HM-KIT-022]"
         )
-    others = {name: names for name, names in groups.items() if not _is_gain(names)}
+    others = {
+        name: names
+        for name, names in groups.items()
+        if not (names and all(n.startswith(GAIN) for n in names))
+    }
     return others or groups
-
-
-def _is_gain(names: Sequence[str]) -> bool:
-    return bool(names) and all(name.startswith(GAIN) for name in names)

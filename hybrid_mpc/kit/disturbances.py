@@ -22,13 +22,9 @@ OFF = 0.2
 CARRIES = 1.0
 """Largest disturbance, over its size, that errors of the parameters may require. An input that needs more has so little
 effect at steady state that a load there explains no error: its estimate would drift away."""
-EXPLAINED = 0.01
-"""Largest deviation of an output, over its size, that does not count as an offset."""
 QUARTER, RUN, STILL = 0.25, 5000, 1e-6
 """Step of an input as a share of its range; longest run to steady state [periods]; change a period, over a state's
 size, that counts as steady."""
-REACH = 0.5
-"""Share of the horizon within which a disturbance of a rate moves the state by the state's size."""
 
 
 def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance, ...] | None:
@@ -68,7 +64,8 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
         Disturbance("output", model.outputs[i].name, float(sizes.outputs[i]))
         for i in [*free, *held][: model.n_y - n_in]
     ]
-    if own and unexplained(replace(model, disturbance_model=None), control) <= EXPLAINED:
+    # largest deviation of an output, over its size, that does not count as an offset
+    if own and unexplained(replace(model, disturbance_model=None), control) <= 0.01:
         own = []
     at_inputs = [_with_inputs(model, way, own) for way in combinations(range(model.n_u), n_in)]
     found = [one for one in at_inputs if distinguishable(one, sizes.states).detectable]
@@ -97,7 +94,8 @@ def _with_rates(model: HybridModel, control: OCP, held: list[int], sizes: Sizes)
     speeds), and of the other outputs; None if an output does not depend on exactly one state.
     """
     rows = output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full()
-    speeds, reach = kinematics(model), REACH * control.horizon * model.dt
+    # share of the horizon within which a disturbance of a rate moves the state by the state's size
+    speeds, reach = kinematics(model), 0.5 * control.horizon * model.dt
     chosen: list[Disturbance] = []
     for i, signal in enumerate(model.outputs):
         if i not in held:

@@ -67,8 +67,6 @@ SPLIT_SCHEMA = 5
 """Previous format version with several files; it can be migrated, too."""
 OLD_FILES = (OLD_FILE, "programs.json", "weights.safetensors")
 SPLIT_FILES = ("watch/energy.json", "watch/residuals.json", "guard.json")
-BENCHMARK_NOTE = "benchmark_model.json"
-"""File of a benchmark's model, which is not an artifact."""
 MOST_MODELS = 16
 """Largest number of models in an artifact: prior, hybrid, and a few for comparison."""
 HYBRID = "hybrid"
@@ -631,12 +629,6 @@ def artifact_folder(folder: Path) -> Path:
         if is_file(place / OLD_FILE):
             raise InputError(
                 f"{place / OLD_FILE}: this kit has an older format with a single file. {_anew(place)} [HM-KIT-036]"
-            )
-        if is_file(place / BENCHMARK_NOTE):
-            raise InputError(
-                f"{folder}: folder of a benchmark, whose model ({place / BENCHMARK_NOTE}) has no controller. "
-                f"Evaluate it with: hybrid-mpc benchmark SCENARIO --model {folder} --test FILE. For loops, run the "
-                "scenario on the same recordings: hybrid-mpc run SCENARIO --data FILE --out FOLDER [HM-KIT-037]"
             )
     try:
         state = f"no {KIT} in it" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"

@@ -40,8 +40,6 @@ TIMED = ("estimate", "solve", "monitor", "prepare")
 """Timed parts of a period: the first two before the input, the others after it."""
 MOST_SKIPPED = 10**12
 """Largest number of periods that can be skipped at once, so that the time [s] stays finite."""
-LONG = 250
-"""Skipped periods after which the estimator restarts, since its prediction has become useless."""
 
 
 class Reading(Protocol):
@@ -360,7 +358,8 @@ class Loop:
         self.finish()
         state, missing = self.state, np.full(self.model.n_y, np.nan)
         estimate, guard, u = state.estimate, state.guard, state.decision.u
-        if n > LONG:
+        # skipped periods after which the estimator restarts, since its prediction has become useless
+        if n > 250:
             estimate = None
         elif estimate is not None:
             for i in range(1, n + 1):

@@ -31,8 +31,6 @@ from hybrid_mpc.model.limits import check_function, check_part, sampled, whole
 Array = NDArray[np.float64]
 TIMED = ("measure", "estimate", "solve", "actuate", "monitor", "prepare")
 """Timed parts of a period, in this order: the input is applied after ``actuate``."""
-RECENT = 25
-"""Number of recent solves; the fastest of them decides whether a solve can meet its deadline."""
 QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
 ENDING = tuple(
     getattr(signal, name)
@@ -44,8 +42,6 @@ Ctrl-\\, Ctrl-Break, limit of computing time, Ctrl-Z."""
 PAUSES_S = (0.0, 0.01, 0.1, 1.0)
 """Pauses [s] before each further attempt to apply the safe input: none after a message that a signal interrupted, then
 the time that a bus or its driver may need to recover. There are no more attempts, since the process must end."""
-EARLY = 1e-3
-"""Share of a period by which a wait may end early: rounding, irrelevant for a controller."""
 WAKES = 10
 """Largest number of successive waits that end early: an interrupted sleep is continued."""
 
@@ -244,7 +240,8 @@ class _Run:
         self.k = self._periods = self._skipped = self._missing = self._late = self._overruns = 0
         self._sources: Counter[str] = Counter()
         self._rows: deque[RunnerStep] = deque(maxlen=runner._keep)
-        self._solves: deque[float] = deque(maxlen=RECENT)
+        # number of recent solves; the fastest of them decides whether a solve can meet its deadline
+        self._solves: deque[float] = deque(maxlen=25)
         self._start = 0.0
 
     def begin(self) -> None:
@@ -603,7 +600,8 @@ class CheckedClock:
     """
 
     def __init__(self, clock: Clock, dt: float) -> None:
-        self._clock, self._early, self._last = clock, EARLY * dt, -math.inf
+        # share of a period by which a wait may end early: rounding, irrelevant for a controller
+        self._clock, self._early, self._last = clock, 1e-3 * dt, -math.inf
 
     def now(self) -> float:
         """Time [s], checked to be finite and monotonic."""

@@ -128,7 +128,7 @@ def simulate(
             check_function(function, name)
     if not isinstance(stage_cost, OCP | None):
         raise InputError(f"stage_cost: give an OCP, got {type(stage_cost).__name__} [HM-LOOP-043]")
-    if isinstance(faults, str | bytes) or not all(isinstance(fault, Fault) for fault in _list_items(faults)):
+    if not isinstance(faults, list | tuple) or not all(isinstance(fault, Fault) for fault in faults):
         raise InputError(f"faults: give a list of Fault, got {type(faults).__name__} [HM-LOOP-044]")
     seed = whole(seed, "seed", 0, 2**63 - 1)
     sensor_delay, input_delay = (
@@ -169,7 +169,9 @@ def simulate(
         y = machine.measure(t)
         truth = np.concatenate([x, plant.hidden(machine.state)])
         in_time = None if late is None else partial(_in_time, late, t)
-        now_w = np.zeros(0) if surroundings is None else _row_at(surroundings, t, n_w)
+        now_w = np.zeros(0)
+        if surroundings is not None:
+            now_w = sampled(surroundings(np.array([t])), (1, n_w), "what w returns for one instant")[0]
         if k == 0:
             loop.start(y, now_w, truth=truth, in_time=in_time)
             machine.rest(loop.state.inputs[0])
@@ -192,11 +194,6 @@ def simulate(
     return _build_result(rows, dt, loop.switches)
 
 
-def _list_items(faults: object) -> Sequence[object]:
-    """The items of a list or tuple; otherwise the object itself as single item."""
-    return faults if isinstance(faults, list | tuple) else (faults,)
-
-
 def _make_disturbances(w: Preview | ArrayLike | None, model: HybridModel, n_w: int) -> Preview | None:
     """The first ``n_w`` disturbances, those measured, as a function of time; None if there are none.
 
@@ -212,10 +209,6 @@ def _make_disturbances(w: Preview | ArrayLike | None, model: HybridModel, n_w: i
         return w
     constant = model.w[:n_w] if w is None else vector(w, n_w, "w")
     return lambda t: np.tile(constant, (len(t), 1))
-
-
-def _row_at(w: Preview, t: float, n_w: int) -> Array:
-    return sampled(w(np.array([t])), (1, n_w), "what w returns for one instant")[0]
 
 
 class _Goal(NamedTuple):

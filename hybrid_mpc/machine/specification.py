@@ -169,17 +169,20 @@ class ChoiceRule:
 
 @dataclass(frozen=True)
 class BenchmarkBudget:
-    """Effort of the networks of one benchmark.
+    """Effort of the training of a machine's networks.
 
     Args:
-        hidden: Hidden units z.
-        networks: Number of networks of each kind.
+        hidden: Hidden units of each network.
+        networks: Networks trained per model, each without another part of the data. Their mean is deployed: one network
+            of ``networks * hidden`` hidden units z, which determines the time of a control step.
         teacher_steps: Optimiser steps with teacher forcing.
         free_run_steps: Optimiser steps on free runs.
-        horizon: Most counted periods of a free run in training.
+        horizon: Most counted periods of a free run in training. Default: 50.
         batch: Windows per step. Default: 32.
-        decay: Weight decay times the number of training samples. Default: as in training.
-        prior_replay: Weight that fades corrections where nothing was measured (``TrainingSettings``). Default: zero.
+        decay: Weight decay times the number of training samples: fewer samples need more decay against overfitting.
+            Default: 300.
+        prior_replay: Weight that fades corrections where nothing was measured (``TrainingSettings``), for a machine
+            whose tasks leave the range of its recordings. Default: zero.
 
     Example:
         >>> BenchmarkBudget(hidden=16, networks=2, teacher_steps=100, free_run_steps=200, horizon=40).batch
@@ -190,13 +193,13 @@ class BenchmarkBudget:
     networks: Count
     teacher_steps: CountOrNone
     free_run_steps: CountOrNone
-    horizon: Count
+    horizon: Count = 50
     batch: Count = 32
     decay: NotNegative = 300.0
     prior_replay: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        Fields(self, "benchmark budget").refuse()
+        Fields(self, "budget").refuse()
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,6 @@ Place: TypeAlias = Literal["force", "potential", "rate", "input", "disturbance",
 PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "disturbance", "output")
 REPLACED: tuple[Place, ...] = ("input", "disturbance", "output")
 """Places whose signal a term replaces."""
-LEAST_SHARE = 1e-4
-"""Square of the distance from a reference, over its scale, that keeps a loss' slope finite where both are equal."""
 Option: TypeAlias = Signal | tuple[float, ...] | bool | float | str
 
 
@@ -797,7 +795,8 @@ def loss(of: str, k: Parameter, n: Parameter, *, scale: float, reference: str | 
     def law(at: At, p: Any) -> Any:
         far = at.own - (_signal(at, reference) if isinstance(reference, str) else reference)
         share = far / scale
-        return -p[0] * far * (share * share + LEAST_SHARE) ** (0.5 * (p[1] - 1.0))
+        # square of the distance from a reference, over its scale, that keeps a loss' slope finite where both are equal
+        return -p[0] * far * (share * share + 1e-4) ** (0.5 * (p[1] - 1.0))
 
     to = reference if isinstance(reference, str) else f"{reference:.3g}"
     far_off = _from(of, to)

@@ -29,7 +29,8 @@ def blended(prior: HybridModel, hybrid: HybridModel, share: float = BLEND_SHARE.
         share: Value of the parameter. Default: 1, the hybrid.
 
     Raises:
-        InputError: If the models have other states, inputs, disturbances or parameters, or a parameter is named ``correction_share``.
+        InputError: If the models have other states, inputs, disturbances or parameters, or a parameter has the name of
+            :data:`BLEND_SHARE`.
 
     Example:
         >>> from hybrid_mpc.machine.signals import Signal

@@ -21,8 +21,6 @@ from hybrid_mpc.model.model import Expression, HybridModel, output_with_jacobian
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
-SETTLED = 1e-10
-"""Largest change per step of a settled hidden state."""
 SETTLING = 6
 """Most Newton steps that settle a hidden state."""
 ITERATIONS = 60
@@ -45,14 +43,8 @@ NEAR = 1e-5
 """Largest step, in scales of the unknowns, that rounding may prevent from reducing the residual."""
 CONTRACTS = 0.7
 """Largest ratio of a step to the previous one in a descent whose end does not depend on rounding."""
-LEAST_SHARE = 1e-3
-"""Smallest share of a step that is tried."""
 FOLLOWED, LEAST_PART, MOST_PARTS = 0.125, 1 / 1024, 100
 """First and smallest part of the way of a continuation, and the most descents."""
-RUN = 5000
-"""Most periods of the model's own run."""
-NEARER = 1e-3
-"""Largest residual, in the states' scales, at which a run has nearly settled."""
 EQUAL = 1e-3
 """Largest relative difference between deviations of equally good steady states."""
 EXACT = 1e-12
@@ -318,7 +310,8 @@ class SteadySearch:
                     if then.merit < at.merit:
                         sure = sure and (again < NEAR or again <= CONTRACTS * size)
                         after, before = then, again
-            while not after.merit < at.merit and share > LEAST_SHARE:
+            # smallest share of a step that is tried
+            while not after.merit < at.merit and share > 1e-3:
                 share, sure = 0.5 * share, sure and size < NEAR
                 after = self._settled(at.v + share * step, goal)
             if not after.merit < at.merit:
@@ -529,12 +522,14 @@ def run_to_rest(search: SteadySearch, v: Array) -> Array | None:
     equations, v = search.equations, v.copy()
     assert isinstance(equations, StepEquations)
     n_z = search.size.size
-    for _ in range(RUN):
+    # most periods of the model's own run
+    for _ in range(5000):
         after = equations.after(v)
         moved, v[:n_z] = np.max(np.abs((after - v[:n_z]) / search.size)), after
         if not moved > STEADY:
             break
-    return v if search.lacks(v) < NEARER else None
+    # largest residual, in the states' scales, at which a run has nearly settled
+    return v if search.lacks(v) < 1e-3 else None
 
 
 def fixed_point(model: HybridModel, u: ArrayLike, x_guess: ArrayLike) -> tuple[Array, Array]:
@@ -582,7 +577,8 @@ def hidden_fixed_point(
     for _ in range(limit if model.n_h else 0):
         h_next = model.step(x, h, u, held, model.p)[1].full().ravel()
         moved, h = np.max(np.abs(h_next - h)), h_next
-        if not moved > SETTLED:
+        # largest change per step of a settled hidden state
+        if not moved > 1e-10:
             break
     return h
 

@@ -283,7 +283,8 @@ def costs(table: Costs) -> Figure:
             f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of the controller 'oracle', to"
             " which costs are relative [HM-PLOTS-028]"
         )
-    present = _ordered({name for row in relative.values() for name in row})
+    there = {name for row in relative.values() for name in row}
+    present = [name for name in CONTROLLERS if name in there] + sorted(there - set(CONTROLLERS))
     height = 0.25 + 0.11 * len(present)
     figure, axes = new_figure(1, 1, size=(9, 1.5 + height * len(table)))
     ax = axes[0, 0]
@@ -323,11 +324,6 @@ def _relative(row: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
         name: (mean / scale, half / scale if math.isfinite(half) else 0.0)
         for name, (mean, half) in finite.items()
     }
-
-
-def _ordered(names: set[str]) -> list[str]:
-    """Order names: the known controllers in their order, then others by name."""
-    return [name for name in CONTROLLERS if name in names] + sorted(names - set(CONTROLLERS))
 
 
 def _style(name: str) -> dict[str, Any]:

@@ -33,12 +33,8 @@ LEFT = 0.5
 ENOUGH, ORDINARY, SECOND = 0.15, 1 / 3, 0.5
 """A second cause is searched if the first leaves more than 15 % of the squared errors, or errors above a third of the
 threshold; it is accepted if it halves the remaining squared errors."""
-ONSETS = 14
-"""Largest number of tested onsets."""
 ALIKE = 4.0
 """Difference of misfits (2 standard deviations, squared) below which two causes cannot be distinguished."""
-RIDGE = 1e-9
-"""Regularization of the least squares, relative to the squared norm of the columns, for unobservable directions."""
 REFINED, ITERATIONS = 4, 3
 """Number of the best linear fits that are refined, and their number of Gauss-Newton steps."""
 RANGE = (-0.98, 4.0)
@@ -280,7 +276,8 @@ class Diagnoser:
     def _onsets(self, window: Window) -> list[int]:
         """Candidate onsets [sample] before the alarm, within the length of the averages and the window."""
         back = [*range(self.short + 1), 2 * self.short, self.before // 3, self.before // 2]
-        chosen = [back[i] for i in evenly(len(back), ONSETS)]
+        # largest number of tested onsets
+        chosen = [back[i] for i in evenly(len(back), 14)]
         return sorted({max(window.alarm - b, 1) for b in chosen})
 
     def _linear(self, window: Window, theta: Array, start: Array, onset: int) -> tuple[Array, Array]:
@@ -354,7 +351,8 @@ def _fit(errors: Array, slopes: Array, nuisance: int, causes: tuple[int, ...], o
     size = np.linalg.norm(used, axis=0)
     size = np.where(size > 0, size, 1.0)
     scaled = used / size
-    normal = scaled.T @ scaled + RIDGE * np.eye(len(size))
+    # regularization of the least squares, relative to the squared norm of the columns, for unobservable directions
+    normal = scaled.T @ scaled + 1e-9 * np.eye(len(size))
     inverse = np.linalg.inv(normal)
     found = inverse @ (scaled.T @ errors) / size
     left = errors - used @ found

@@ -351,14 +351,6 @@ def force_units(model: HybridModel) -> tuple[str, ...]:
     return tuple(FORCES.get((rate, v.unit), f"{rate}/({v.unit})") for v in model.states[model.n_x // 2 :])
 
 
-def force_unit(model: HybridModel) -> str:
-    """Units of the residual forces, without duplicates.
-
-    Example: ``force_unit(kit.models["prior"])`` is ``"N m"`` for a pendulum, ``"N, N m"`` for a cart with one.
-    """
-    return ", ".join(dict.fromkeys(force_units(model)))
-
-
 def inertia_of(model: HybridModel, x: ca.MX, u: ca.MX) -> ca.MX:
     """Inertia matrix ``M(q)`` of the energy balance, which is ``v' M a`` plus terms without ``a``."""
     n_q = model.n_x // 2

@@ -26,16 +26,10 @@ MAX_EXTRAPOLATION = 20.0
 """Longest mean time between false alarms, in multiples of the nominal data's length."""
 MARGIN = 1.5
 """Threshold over the highest nominal level if nominal data are too short for the rate."""
-ROUNDS = 5
-"""Number of reweighted least-squares fits of a variance."""
-FLOOR = 1e-3
-"""Smallest constant term of a variance over its mean, so that the scale is positive in quiet data."""
 BOOTSTRAPS = 200
 """Number of bootstrap samples of the thresholds."""
 NEIGHBOURS = 6
 """Successive blocks that are resampled together (half a minute with blocks of 5 s), longer than their correlation."""
-ODD = 1e-4
-"""Probability of the largest block maximum below which a block does not count as nominal."""
 NEVER = 1e300
 """A threshold that is never exceeded."""
 
@@ -286,7 +280,8 @@ def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
     low, high = np.quantile(maxima, [0.25, 0.75])
     scale = max((high - low) / (-math.log(-math.log(0.75)) + math.log(-math.log(0.25))), 1e-12)
     location = low + scale * math.log(-math.log(0.25))
-    limit = location - scale * math.log(-math.log1p(-ODD) / maxima.size)
+    # probability of the largest block maximum below which a block does not count as nominal
+    limit = location - scale * math.log(-math.log1p(-1e-4) / maxima.size)
     odd = np.flatnonzero(maxima > limit)
     if odd.size:
         places = ", ".join(f"{i * block_s:g}" for i in odd[:5])
@@ -343,10 +338,12 @@ def _scale_of(
         )
     from scipy.optimize import nnls  # slow to import, and a running monitor does without
 
-    floor = FLOOR * float(np.mean(squares))
+    # smallest constant term of a variance over its mean, so that the scale is positive in quiet data
+    floor = 1e-3 * float(np.mean(squares))
     spread = np.full(squares.size, float(np.mean(squares)))
     found = np.zeros(features.shape[1])
-    for _ in range(ROUNDS):
+    # number of reweighted least-squares fits of a variance
+    for _ in range(5):
         found, _ = nnls(features / spread[:, None], squares / spread)
         found[0] = max(found[0], floor)
         spread = features @ found

@@ -33,8 +33,6 @@ SHARE = 0.05
 the recorded machines (0.002 m/s to 0.1 rad/s) has reached 99 %."""
 QUANTILE = 0.99
 """Quantile of the speeds in motion that counts as working speed; it is robust to outliers and pushes by hand."""
-DEVIATIONS = 3.0
-"""Speeds within this many standard deviations of the sensor noise count as rest."""
 
 
 def seconds(length: float, model: HybridModel) -> float:
@@ -96,7 +94,8 @@ def rest_speeds(recordings: Sequence[Outputs], model: HybridModel) -> tuple[floa
             f"({(2 * half + 1) * model.dt:g} s). Give longer recordings [HM-WATCH-027]"
         )
     speeds = np.abs(np.concatenate([speeds_of(r, model.dt, half) for r in long]))
-    least = DEVIATIONS * noise_of(long) * speed_gain(model.dt, half)
+    # speeds within this many standard deviations of the sensor noise count as rest
+    least = 3.0 * noise_of(long) * speed_gain(model.dt, half)
     found = []
     for v, noise in zip(speeds.T, least.tolist(), strict=True):
         moving = v[v > noise]

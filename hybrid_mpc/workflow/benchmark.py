@@ -1,4 +1,4 @@
-"""``hybrid-mpc benchmark``: fit and train on training recordings, and evaluate free runs over test recordings.
+"""``hybrid-mpc benchmark``: the stages of a run on given training files, and free runs over test files.
 
 Every choice (settings, networks, recommended model) depends on training and validation data only.
 """
@@ -6,9 +6,8 @@ Every choice (settings, networks, recommended model) depends on training and val
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,23 +17,19 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.data.scales import time_unit
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Dataset, Trajectory
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError, refuse
-from hybrid_mpc.files import check_writable, digest, locked, read_document, write_document, write_json
-from hybrid_mpc.folder import JobNote, versions, write_note
-from hybrid_mpc.identify.choose import Choice, evidence_of, recommend
-from hybrid_mpc.identify.evaluate import OutputErrors, free_runs, unseen_runs
-from hybrid_mpc.identify.fit import fit_prior, refit, smoothed
-from hybrid_mpc.identify.linear import BASELINES, LinearModel
+from hybrid_mpc.files import check_writable, digest, locked, write_json
+from hybrid_mpc.folder import JobNote, open_folder, read_note
+from hybrid_mpc.identify.evaluate import OutputErrors
+from hybrid_mpc.identify.fit import refit
+from hybrid_mpc.identify.linear import LinearModel
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.settings import TrainingSettings, kinds_of
-from hybrid_mpc.identify.step import PriorStep, Step
 from hybrid_mpc.identify.train import Trained
-from hybrid_mpc.kit.parts import BENCHMARK_NOTE
 from hybrid_mpc.machine.prior import Prior
-from hybrid_mpc.machine.specification import BenchmarkBudget
-from hybrid_mpc.records import plain, record
+from hybrid_mpc.machine.specification import BenchmarkBudget, DataSpec
+from hybrid_mpc.records import BESIDE, plain, record
 from hybrid_mpc.scenario import Scenario, load_scenario
 from hybrid_mpc.workflow.benchmark_runs import (
     BenchmarkRun,
@@ -46,13 +41,29 @@ from hybrid_mpc.workflow.benchmark_runs import (
     run_error,
     run_freely,
     scored_signals,
-    warm_samples,
 )
-from hybrid_mpc.workflow.stages.choose import CANDIDATES
-from hybrid_mpc.workflow.stages.identify import PARTS, load_trained, save_trained, train_kinds
+from hybrid_mpc.workflow.context import Context
+from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stage import Stage, bring_up_to_date
+from hybrid_mpc.workflow.stages.choose import CANDIDATES, CHOICE, ChoiceResult, choice_stage
+from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, TASKS
+from hybrid_mpc.workflow.stages.identify import (
+    DATA,
+    PRIOR,
+    TRAINING,
+    DataResult,
+    PriorResult,
+    TrainingResult,
+    examined_prior,
+    linear_models,
+    stops,
+    trained_models,
+)
+from hybrid_mpc.workflow.stages.results import read_as
 
 Array = NDArray[np.float64]
-SCHEMA = 3
+NOUN = "benchmark"
+SCHEMA_VERSION = 4
 SHOWN = 20.0
 """Length of a run that is drawn in full [time constants of the machine]."""
 IN_MOTION = 0.1
@@ -61,8 +72,6 @@ not determine speed and acceleration. Whole recordings with a shorter warm-up (E
 REFIT_LENGTHS = (0.5, 1.0, 3.0)
 """Lengths of the free runs of a refit [time constants of the machine], the short ones first: from a bad start, the fit
 of long runs does not converge. Short runs alone spend most of the data on their initial states."""
-FEWEST_RUNS = 3
-"""Smallest number of free runs of a refit: a single run would be fitted by many parameters."""
 
 
 @dataclass(frozen=True)
@@ -92,61 +101,204 @@ class BenchmarkSettings:
 
 
 @dataclass(frozen=True)
-class _Description:
-    """Content of the JSON file next to the networks, see :class:`BenchmarkModel`."""
+class _Note:
+    """What a benchmark was made of; another one in its folder is refused."""
 
     scenario: str
+    data: str
     dt: float
-    fit: PriorFit
-    hybrid: str
-    validation: Mapping[str, OutputErrors]
-    long: Mapping[str, OutputErrors]
-    kinds: tuple[str, ...]
-    linear: Mapping[str, LinearModel]
-    no_linear: Mapping[str, str]
-    choice: Choice
+    budget: str
+    seed: int
+    pieces: str
 
 
-@dataclass(frozen=True)
-class BenchmarkModel(_Description):
-    """Everything that a free run over another recording needs: prior, recommended model (``hybrid``), networks by kind.
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkChoice(ChoiceResult):
+    """A run's choice, which long runs may overrule: see :func:`recommended`.
 
-    ``validation`` and ``long`` are the errors of every model on validation pieces and on :attr:`Recordings.long`;
-    ``linear`` are the linear baselines by name, ``no_linear`` says why a baseline is missing. ``choice`` compares the
-    networks with the prior on held-out data.
+    Args:
+        validation: Errors of every model on validation pieces.
+        long: Errors on :attr:`Recordings.long`; empty without such runs.
+        linear: Linear models by name.
+        no_linear: Why a linear model is missing, by name.
     """
 
-    networks: Mapping[str, Trained]
+    validation: Mapping[str, OutputErrors]
+    long: Mapping[str, OutputErrors]
+    linear: Mapping[str, LinearModel]
+    no_linear: Mapping[str, str]
 
 
 @dataclass(frozen=True)
 class Refit:
-    """Refit for a changed machine: errors with old and new parameters over the part after the refitted seconds."""
+    """Refit for a changed machine.
+
+    Args:
+        seconds: Length [s] of the data of the refit, at the start of the file.
+        values: Refitted parameters.
+        before: Errors of prior and recommended model over the rest, with the old parameters.
+        after: Errors with the refitted parameters.
+    """
 
     seconds: float
-    prior: Sequence[Mapping[str, Any]]
+    values: Mapping[str, float]
     before: Mapping[str, OutputErrors]
     after: Mapping[str, OutputErrors]
 
 
 @dataclass(frozen=True)
 class FileResult:
-    """A test file: its free runs, the errors by model (``"hybrid"`` is the recommended model), and the length of the
-    evaluated data ``scored_s`` [s].
+    """Free runs over a test file.
+
+    Args:
+        errors: Errors by model; ``"hybrid"`` is the recommended model.
+        scored_s: Length [s] of the evaluated data.
+        refit: Refit for a changed machine. Default: none.
+        runs: The free runs. They are not in ``results.json``.
     """
 
-    runs: Sequence[BenchmarkRun]
     errors: Mapping[str, OutputErrors]
     scored_s: float
     refit: Refit | None = None
+    runs: Sequence[BenchmarkRun] = field(default=(), compare=False, metadata=BESIDE)
 
 
 @dataclass(frozen=True)
 class BenchmarkResults:
-    """The model of a benchmark, and the results of each test file."""
+    """``results.json`` of a benchmark: the results of a run's stages, and free runs over the test files.
 
-    model: BenchmarkModel
+    Args:
+        schema_version: Version of ``results.json``.
+        scenario: Name of the scenario.
+        seed: Seed of the training.
+        budget: Name of the benchmark budget.
+        versions: Versions of the packages by name.
+        warnings: Warnings about the recordings of this command.
+        data: Training recordings.
+        prior: Fitted prior. Its errors are those on held-back recordings, or else on the validation pieces.
+        training: Trained networks.
+        choice: Recommended model, and the errors of all on validation data.
+        test: Free runs by test file.
+    """
+
+    schema_version: int
+    scenario: str
+    seed: int
+    budget: str
+    versions: Mapping[str, str]
+    warnings: tuple[str, ...]
+    data: DataResult
+    prior: PriorResult
+    training: TrainingResult
+    choice: BenchmarkChoice
     test: Mapping[str, FileResult]
+
+    @property
+    def hybrid(self) -> str:
+        """The recommended model."""
+        return self.choice.choice.recommended
+
+
+@dataclass(frozen=True)
+class BenchmarkContext(Context):
+    """A benchmark in its folder: a run whose recordings, budget and lengths of runs are those of the benchmark.
+
+    Args:
+        recordings: The training recordings. Default: none, the stages' results are only read.
+    """
+
+    recordings: Recordings | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def effort(self) -> BenchmarkBudget:
+        """Effort of the training."""
+        return benchmark_of(self.scenario).budgets[self.settings.budget]
+
+    @property
+    def spec(self) -> DataSpec:
+        """The data specification; free runs are as long as those over test files."""
+        return replace(self.scenario.data, free_run=benchmark_of(self.scenario).length)
+
+    @property
+    def fit_length(self) -> float:
+        """Length [s] of the longest free runs that the prior is fitted to."""
+        spec = benchmark_of(self.scenario)
+        return spec.length or spec.piece
+
+    @property
+    def dataset(self) -> Dataset:
+        """The training recordings. Held-back pieces have the role of the test; without them, validation pieces do."""
+        assert self.recordings is not None
+        own = self.recordings
+        last = own.held_back or tuple(replace(piece, role="test") for piece in own.valid)
+        parts = enumerate((*own.train, *own.valid, *last), 1)
+        pieces = tuple(replace(piece, name=f"{piece.file}#{i}") for i, piece in parts)
+        return replace(own.dataset, trajectories=pieces)
+
+    def networks(self, choice: ChoiceResult) -> dict[str, Trained]:
+        """Trained networks by kind, each with the share of its correction that was chosen."""
+        prior, kinds = self.scenario.prior(self.prior.fit.values), self.read(TRAINING).weights
+        return {kind: trained_models(self, kind).shrunk(prior, choice.choice.share(kind)) for kind in kinds}
+
+
+def prior_of_benchmark(context: Context) -> PriorResult:
+    """The fitted prior; a poor one is reported, and does not stop the benchmark."""
+    found = examined_prior(context)
+    for why in stops(found):
+        context.progress.warn(why)
+    return found
+
+
+def choice_of_benchmark(context: Context) -> BenchmarkChoice:
+    """The choice of a run, and the errors of all models on validation pieces and long runs, which may overrule it."""
+    assert isinstance(context, BenchmarkContext)
+    assert context.recordings is not None
+    data, found, warm_up = context.recordings, choice_stage(context), context.spec.warm_up
+    linear = linear_models(context)
+    fitted = {name: own for name, own in linear.items() if not isinstance(own, str)}
+    errors = partial(candidate_errors, context, context.networks(found), fitted)
+    validation = errors(data.valid, max(warm_up, IN_MOTION * context.time_unit))
+    long = errors(data.long, warm_up) if data.long else {}
+    hybrid = recommended(
+        *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=found.choice.sure
+    )
+    choice = replace(found.choice, recommended=hybrid)
+    if hybrid != found.choice.recommended:
+        why = f"Over validation pieces and long runs {hybrid} has less error than {found.choice.recommended}."
+        choice = replace(
+            choice, reason=f"{choice.reason} {why}", hybrid=choice.hybrid if hybrid == "phy" else hybrid
+        )
+    return BenchmarkChoice(
+        **{**vars(found), "choice": choice},
+        validation=validation,
+        long=long,
+        linear=fitted,
+        no_linear={name: why for name, why in linear.items() if isinstance(why, str)},
+    )
+
+
+def candidate_errors(
+    context: BenchmarkContext,
+    networks: Mapping[str, Trained],
+    linear: Mapping[str, LinearModel],
+    trajectories: Sequence[Trajectory],
+    warm_up: float,
+) -> dict[str, OutputErrors]:
+    """Errors of every model's free runs after a warm-up of ``warm_up`` [s]."""
+    spec, fit = benchmark_of(context.scenario), context.prior.fit
+    prior = context.scenario.prior(fit.values)
+    runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length, linear=linear)
+    return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
+
+
+PRIOR_OF_BENCHMARK = replace(PRIOR, compute=prior_of_benchmark)
+CHOICE_OF_BENCHMARK = Stage(
+    CHOICE.name, CHOICE.title, BenchmarkChoice, choice_of_benchmark, CHOICE.reads, CHOICE.needs
+)
+STAGES: tuple[Stage[Any], ...] = (
+    DATA, PRIOR_OF_BENCHMARK, TRAINING, CHOICE_OF_BENCHMARK, EXPORT, NOISE, TASKS,
+)  # fmt: skip
+"""Stages of a benchmark. They leave a kit in ``model/``; without closed loops, it holds no limits of a monitor."""
 
 
 def benchmark(
@@ -154,7 +306,7 @@ def benchmark(
 ) -> BenchmarkResults:
     """Fit, train and evaluate, or evaluate an existing model. The same command continues an interrupted benchmark.
 
-    ``out`` gets ``results.json`` and, after a training, ``model/`` and ``checkpoints/``.
+    ``out`` gets ``results.json`` and, after a training, the kit ``model/`` and ``checkpoints/``.
 
     Args:
         settings: Machine, files and effort.
@@ -172,27 +324,23 @@ def benchmark(
     check_scenario(replace(scenario, plant=None))  # a benchmark runs no closed loop
     data, tests, warnings = _read(settings, scenario)
     for warning in warnings:
-        progress.warn(warning)
-    check_writable(out)
-    with locked(out):
-        started = time.monotonic()
-        if data is None:
-            assert settings.model is not None
-            model = load_model(settings.model, scenario.name)
-        else:
-            model = _make(settings, scenario, data, out, progress, cluster)
-            tests = tests or ({"held back": data.held_back} if data.held_back else {})
-        for warning in model.fit.warnings:
-            progress.warn(f"fit of the prior: {warning}")
-        progress.start("free runs over the test files")
-        found = {}
-        for i, (name, trajectories) in enumerate(tests.items()):
-            progress.update("files", i, len(tests), name)
-            found[name] = _evaluate(scenario, model, trajectories, settings.refit)
-        progress.finish("")
-        results = BenchmarkResults(model, found)
-        document = _document(settings, scenario, data, results, warnings)
-        write_json(out / "results.json", {**document, "timing": {"seconds": time.monotonic() - started}})
+        if data is None or warning not in data.dataset.warnings:  # stage data tells those
+            progress.warn(warning)
+    if data is None:
+        context = _finished(settings, scenario, progress)
+        check_writable(out)
+    else:
+        own = RunSettings(settings.scenario, settings.data, settings.seed, settings.budget)
+        context = BenchmarkContext(
+            own, scenario, out, progress, cluster, workers=settings.workers, recordings=data
+        )
+        tests = tests or ({"held back": data.held_back} if data.held_back else {})
+    with locked(out) if data is None else open_folder(out, _note(settings, scenario, data), resume=None):
+        for stage in () if data is None else STAGES:
+            progress.start(stage.title)
+            progress.finish(bring_up_to_date(context, stage))
+        results = _evaluated(context, tests, warnings, settings.refit)
+        write_json(out / "results.json", plain(results))
         return results
 
 
@@ -248,161 +396,6 @@ def _read(
     return data, tests, list(dict.fromkeys(warnings))
 
 
-# The model: fit, training and choice; finished parts are read from the folder.
-
-
-def _make(
-    settings: BenchmarkSettings,
-    scenario: Scenario,
-    data: Recordings,
-    out: Path,
-    progress: Progress,
-    cluster: Any,
-) -> BenchmarkModel:
-    _claim(out, settings, data)
-    spec, warm_up, dt = benchmark_of(scenario), scenario.data.warm_up, scenario.data.dt
-    progress.start("fitting the prior")
-    fit = _fitted_prior(scenario, data, out, progress)
-    progress.finish("")
-    progress.start("training the networks")
-    warm = warm_samples(warm_up, fit.delay, dt)
-    train, valid = (list(smoothed(scenario.prior, fit, part, dt)) for part in (data.train, data.valid))
-    budget = spec.budgets[settings.budget]
-    whole = train_kinds(
-        settings.scenario, fit.values, train, valid,
-        {kind: training_settings(kind, budget, seed=settings.seed, warm=warm) for kind in kinds_of(scenario.prior())},
-        out / "checkpoints", workers=settings.workers, on_progress=progress.update, cluster=cluster,
-    )  # fmt: skip
-    progress.finish("")
-    progress.start("fitting the linear baselines")
-    linear, no_linear = _baselines(scenario, data)
-    progress.finish("")
-    choice, prior = _choice(scenario, fit, whole, train, valid), scenario.prior(fit.values)
-    networks = {kind: trained.shrunk(prior, choice.share(kind)) for kind, trained in whole.items()}
-    errors = partial(candidate_errors, scenario, fit, networks, linear)
-    validation = errors(data.valid, max(warm_up, IN_MOTION * time_unit(data.train, dt)))
-    long = errors(data.long, warm_up) if data.long else {}
-    hybrid = recommended(
-        *({name: e.error for name, e in part.items()} for part in (validation, long)), sure=choice.sure
-    )
-    model = BenchmarkModel(
-        scenario=scenario.name,
-        dt=dt,
-        fit=fit,
-        hybrid=hybrid,
-        validation=validation,
-        long=long,
-        kinds=tuple(networks),
-        linear=linear,
-        no_linear=no_linear,
-        choice=choice,
-        networks=networks,
-    )
-    save_model(out / "model", model)
-    return model
-
-
-def _baselines(scenario: Scenario, data: Recordings) -> tuple[dict[str, LinearModel], dict[str, str]]:
-    """Linear models by name, chosen on the same validation pieces, and why a model is missing."""
-    dt, found, missing = scenario.data.dt, {}, {}
-    # the initial state of the other models is estimated with this sample
-    warm = warm_samples(max(scenario.data.warm_up, IN_MOTION), 0.0, dt) + 1
-    for name, fitted in BASELINES.items():
-        try:
-            found[name] = fitted(data.train, data.valid, dt, warm=warm)
-        except InputError as error:
-            missing[name] = str(error)
-    return found, missing
-
-
-def _claim(out: Path, settings: BenchmarkSettings, data: Recordings) -> None:
-    """Write a note of the training into ``out``; another training in the same folder is refused."""
-    own = {
-        "scenario": settings.scenario,
-        "data": data.dataset.hash,
-        "budget": settings.budget,
-        "seed": settings.seed,
-        "pieces": digest(
-            [[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)]
-        ),
-    }
-    write_note(out, JobNote("benchmark", own), resume=None)
-
-
-def _fitted_prior(scenario: Scenario, data: Recordings, out: Path, progress: Progress) -> PriorFit:
-    """The fitted prior, read from ``out`` if it is already there."""
-    note, spec = out / "checkpoints" / "prior.json", benchmark_of(scenario)
-    if note.is_file():
-        held = read_document(note, "delete this file; then the same command fits the prior again")
-        return record(PriorFit, held, str(note))
-    fit = fit_prior(
-        scenario.prior, data.train, data.valid, dt=scenario.data.dt, length=spec.length or spec.piece,
-        largest_delay=scenario.data.largest_delay, on_progress=partial(progress.update, "prior"),
-    )  # fmt: skip
-    write_document(note, plain(fit))
-    return fit
-
-
-def training_settings(kind: str, budget: BenchmarkBudget, *, seed: int, warm: int) -> TrainingSettings:
-    """Training settings of one kind: free runs are trained on the output error, which the benchmark evaluates."""
-    return TrainingSettings(
-        kind=kind,  # type: ignore[arg-type]
-        seed=seed,
-        warm=warm,
-        objectives=("output", "balances"),
-        parts=max(PARTS, budget.networks),
-        **asdict(budget),
-    )
-
-
-def candidate_errors(
-    scenario: Scenario,
-    fit: PriorFit,
-    networks: Mapping[str, Trained],
-    linear: Mapping[str, LinearModel],
-    trajectories: Sequence[Trajectory],
-    warm_up: float,
-) -> dict[str, OutputErrors]:
-    """Errors of every model's free runs after a warm-up of ``warm_up`` [s]."""
-    spec, prior = benchmark_of(scenario), scenario.prior(fit.values)
-    runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length, linear=linear)
-    return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
-
-
-def _choice(
-    scenario: Scenario,
-    fit: PriorFit,
-    networks: Mapping[str, Trained],
-    training: Sequence[Trajectory],
-    validation: Sequence[Trajectory],
-) -> Choice:
-    """Comparison of the networks with the prior on held-out data; trajectories are smoothed."""
-    prior, dt = scenario.prior(fit.values), scenario.data.dt
-    settings, smoother = networks["pgrnn"].settings, fit.smoother(prior, dt)
-    runs = unseen_runs(settings, training, validation, smoother, benchmark_of(scenario).length)
-
-    def errors(step_of: Callable[[int | None], Step]) -> list[Array]:
-        return [
-            run.squared_errors(smoother.sizes.y)
-            for own, them in runs
-            for run in free_runs(step_of(own), prior, them, settings.warm)
-        ]
-
-    plain_prior = PriorStep(prior, dt, fit.substeps)
-    found = {"phy": errors(lambda own: plain_prior)}
-
-    def of_kind(kind: str, share: float = 1.0) -> list[Array]:
-        trained = networks[kind].shrunk(prior, share)
-        return errors(lambda own: trained.step(prior, dt, own))
-
-    found |= {kind: of_kind(kind) for kind in networks if kind in CANDIDATES}
-    recordings, evidence = evidence_of(runs)
-    return recommend(
-        found, samples=max(1, round(time_unit(training, dt) / dt)), recordings=recordings, evidence=evidence,
-        shrunk=of_kind, rule=scenario.choice,
-    )  # fmt: skip
-
-
 def recommended(
     validation: Mapping[str, float], long: Mapping[str, float], *, sure: Sequence[str] = ("pgrnn", "mopgrnn")
 ) -> str:
@@ -423,80 +416,107 @@ def recommended(
     return min((n for n in CANDIDATES if n in validation and n in able), key=larger)
 
 
-def save_model(folder: Path, model: BenchmarkModel) -> None:
-    """Write a model, its note last: a folder with a note is complete."""
-    for trained in model.networks.values():
-        save_trained(folder, trained)
-    description = {f.name: getattr(model, f.name) for f in fields(_Description)}
-    write_document(folder / BENCHMARK_NOTE, {"schema": SCHEMA, **description})
+def _note(settings: BenchmarkSettings, scenario: Scenario, data: Recordings) -> JobNote:
+    """The note of a benchmark in its folder: another benchmark there is refused."""
+    pieces = digest([[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)])
+    own = _Note(scenario.name, data.dataset.hash, scenario.data.dt, settings.budget, settings.seed, pieces)
+    return JobNote(NOUN, plain(own))
 
 
-def load_model(folder: Path, scenario: str) -> BenchmarkModel:
-    """Read a model from its folder, or from the folder of its benchmark.
+def _finished(settings: BenchmarkSettings, scenario: Scenario, progress: Progress) -> BenchmarkContext:
+    """The benchmark of an existing model, whose results are only read; its folder, or ``model/`` in it, is given.
 
     Raises:
-        InputError: If the model is missing, damaged, or of another machine.
+        InputError: If the folder is no benchmark, damaged, or of another machine or period.
     """
-    folder = folder if (folder / BENCHMARK_NOTE).is_file() else folder / "model"
-    path = folder / BENCHMARK_NOTE
-    if not path.is_file():
+    assert settings.model is not None
+    folder = settings.model
+    if not (folder / f"{NOUN}.json").is_file():
+        folder = folder.resolve().parent
+    if not (folder / f"{NOUN}.json").is_file():
         raise InputError(
-            f"{folder.parent}: no model of a benchmark. Give the folder of 'hybrid-mpc benchmark {scenario} "
+            f"{settings.model}: no model of a benchmark. Give the folder of 'hybrid-mpc benchmark {scenario.name} "
             "--data FILE --out DIR' [HM-WORKFLOW-009]"
         )
-    document = read_document(path, "run the benchmark again")
-    schema = document.pop("schema", None)
-    if schema != SCHEMA:
+    note = record(_Note, read_note(folder, NOUN)["settings"], str(folder / f"{NOUN}.json"))
+    if (note.scenario, note.dt) != (scenario.name, scenario.data.dt):
         raise InputError(
-            f"{path}: schema {schema}, but this version reads {SCHEMA}. Train the model again [HM-WORKFLOW-010]"
+            f"{folder}: holds a model of {note.scenario} with a period of {note.dt:g} s, not of {scenario.name} with "
+            f"{scenario.data.dt:g} s. Give a model of {scenario.name} [HM-WORKFLOW-011]"
         )
-    found = record(_Description, document, str(path))
-    if found.scenario != scenario:
-        raise InputError(
-            f"{folder}: holds a model of {found.scenario}, not of {scenario}. Give a model of {scenario} "
-            "[HM-WORKFLOW-011]"
-        )
-    return BenchmarkModel(**vars(found), networks={kind: load_trained(folder, kind) for kind in found.kinds})
+    own = RunSettings(settings.scenario, (), note.seed, note.budget)
+    return BenchmarkContext(own, scenario, folder, progress)
 
 
-# The evaluation.
+def _evaluated(
+    context: BenchmarkContext,
+    tests: Mapping[str, Sequence[Trajectory]],
+    warnings: Sequence[str],
+    refit: float | None,
+) -> BenchmarkResults:
+    """The results of the stages, and free runs over the test files."""
+    progress, scenario, settings = context.progress, context.scenario, context.settings
+    progress.start("free runs over the test files")
+    choice = context.read(CHOICE_OF_BENCHMARK)
+    networks, found = context.networks(choice), {}
+    for i, (name, trajectories) in enumerate(tests.items()):
+        progress.update("files", i, len(tests), name)
+        found[name] = _evaluate(context, choice, networks, trajectories, refit)
+    progress.finish("")
+    return BenchmarkResults(
+        SCHEMA_VERSION, scenario.name, settings.seed, settings.budget, context.versions, tuple(warnings),
+        context.read(DATA), context.prior, context.read(TRAINING), choice, found,
+    )  # fmt: skip
 
 
 def _evaluate(
-    scenario: Scenario, model: BenchmarkModel, trajectories: Sequence[Trajectory], refit: float | None
+    context: BenchmarkContext,
+    choice: BenchmarkChoice,
+    networks: Mapping[str, Trained],
+    trajectories: Sequence[Trajectory],
+    refit: float | None,
 ) -> FileResult:
-    runs = _runs(scenario, model, model.fit, trajectories)
-    spec, outputs = benchmark_of(scenario), scenario.prior().outputs
-    names = {**{m: m for m in ("phy", *model.kinds)}, "hybrid": model.hybrid, **{m: m for m in model.linear}}
+    scenario, dt, old = context.scenario, context.spec.dt, context.prior.fit
+    spec, outputs, hybrid = benchmark_of(scenario), scenario.prior().outputs, choice.choice.recommended
+
+    def runs_of(fit: PriorFit, over: Sequence[Trajectory]) -> list[BenchmarkRun]:
+        warm_up = context.spec.warm_up
+        if spec.repeated and spec.length is not None:
+            # two more samples than warm-up and evaluated length: the last input, and the sample that it leads to
+            over = in_runs(over, round(warm_up / dt) + round(spec.length / dt) + 2)
+        prior = scenario.prior(fit.values)
+        return run_freely(
+            prior, fit, networks, over, warm_up=warm_up, length=spec.length, linear=choice.linear
+        )
+
+    runs = runs_of(old, trajectories)
+    names = {**{m: m for m in ("phy", *networks)}, "hybrid": hybrid, **{m: m for m in choice.linear}}
+    again: Refit | None = None
+    if refit is not None:
+        new, rest = refitted(scenario.prior, old, trajectories[0], seconds=refit, dt=dt)
+        before, after = (
+            {name: run_error(own, names[name], outputs, spec) for name in ("phy", "hybrid")}
+            for own in (runs_of(fit, [rest]) for fit in (old, new))
+        )
+        again = Refit(refit, new.values, before, after)
     return FileResult(
-        runs,
         {name: run_error(runs, candidate, outputs, spec) for name, candidate in names.items()},
-        sum(len(run.t) for run in runs) * model.dt,
-        None if refit is None else _refit(scenario, model, trajectories[0], refit),
+        sum(len(run.t) for run in runs) * dt,
+        again,
+        runs,
     )
 
 
-def _runs(
-    scenario: Scenario, model: BenchmarkModel, fit: PriorFit, trajectories: Sequence[Trajectory]
-) -> list[BenchmarkRun]:
-    prior, spec = scenario.prior(fit.values), benchmark_of(scenario)
-    warm_up, dt = scenario.data.warm_up, model.dt
-    if spec.repeated and spec.length is not None:
-        # two more samples than warm-up and evaluated length: the last input, and the sample that it leads to
-        trajectories = in_runs(trajectories, round(warm_up / dt) + round(spec.length / dt) + 2)
-    return run_freely(
-        prior, fit, model.networks, trajectories, warm_up=warm_up, length=spec.length, linear=model.linear
-    )
+def read_benchmark(path: Path) -> BenchmarkResults:
+    """Read a benchmark's ``results.json``, checked; arrays and runs are empty.
 
+    Raises:
+        InputError: If the file is missing, damaged, or of another version.
 
-def _refit(scenario: Scenario, model: BenchmarkModel, whole: Trajectory, seconds: float) -> Refit:
-    fit, rest = refitted(scenario.prior, model.fit, whole, seconds=seconds, dt=model.dt)
-    spec, outputs, errors = benchmark_of(scenario), scenario.prior().outputs, []
-    for own in (model.fit, fit):
-        runs = _runs(scenario, model, own, [rest])
-        names = {"phy": "phy", "hybrid": model.hybrid}
-        errors.append({name: run_error(runs, of, outputs, spec) for name, of in names.items()})
-    return Refit(seconds, fit.rows(scenario.prior().parameters), *errors)
+    Example:
+        ``read_benchmark(Path("runs/disk/results.json")).test["hidden.npz"].errors["hybrid"].rmse``
+    """
+    return read_as(BenchmarkResults, SCHEMA_VERSION, path, "the benchmark")
 
 
 def refitted(
@@ -510,7 +530,8 @@ def refitted(
         InputError: If the recording is not longer than ``seconds``, or ``seconds`` is too short for a fit.
     """
     lengths = [time_unit([trajectory], dt) * own for own in REFIT_LENGTHS]
-    n, least = round(seconds / dt), FEWEST_RUNS * lengths[0]
+    # smallest number of free runs of a refit: a single run would be fitted by many parameters
+    n, least = round(seconds / dt), 3 * lengths[0]
     if n >= len(trajectory.t) - 1 or seconds < least:
         raise InputError(
             f"{trajectory.name}: a refit of {seconds:g} s is not possible. It needs at least {least:g} s and less than "
@@ -522,70 +543,12 @@ def refitted(
     return refit(make, fit, [first], dt=dt, lengths=lengths), rest
 
 
-# Output: results.json, figures, table.
-
-
-def _document(
-    settings: BenchmarkSettings,
-    scenario: Scenario,
-    data: Recordings | None,
-    results: BenchmarkResults,
-    warnings: Sequence[str],
-) -> dict[str, Any]:
-    """The content of ``results.json`` without the computing time."""
-    trained = settings.model is None
-    notes = {}
-    if data is not None:
-        parts = {"train": data.train, "valid": data.valid, "held_back": data.held_back}
-        notes["data"] = {
-            "files": data.dataset.files,
-            "hash": data.dataset.hash,
-            "seconds": {role: sum(len(t.t) for t in part) * results.model.dt for role, part in parts.items()},
-            "validated_on": [piece.name for piece in data.valid],
-        }
-    test = {
-        name: {**row.errors, **({} if row.refit is None else {"refit": row.refit}), "scored_s": row.scored_s}
-        for name, row in results.test.items()
-    }
-    return {
-        "schema": SCHEMA,
-        "machine": scenario.name,
-        "budget": settings.budget if trained else None,
-        "seed": settings.seed if trained else None,
-        **notes,
-        "warnings": warnings,
-        "model": describe(results.model, scenario),
-        "test": test,
-        "versions": versions(),
-    }
-
-
-def describe(model: BenchmarkModel, scenario: Scenario) -> dict[str, Any]:
-    """Plain description of a model: parameters, delay, smoother, errors by candidate and network."""
-    fit = model.fit
-    return {
-        "prior": fit.rows(scenario.prior().parameters),
-        "identifiability": fit.identifiability,
-        "fits": fit.stages,
-        "delay_s": fit.delay,
-        "smoother": {"sigma": fit.sigma, "walk": fit.walk},
-        "hybrid": model.hybrid,
-        "choice": model.choice,
-        "validation": model.validation,
-        "long": model.long,
-        "baselines": {name: {"chosen": own.chosen.text} for name, own in model.linear.items()}
-        | {name: {"reason": why} for name, why in model.no_linear.items()},
-        "networks": {kind: trained.validation for kind, trained in model.networks.items()},
-        "faults": {kind: trained.failures for kind, trained in model.networks.items()},
-    }
-
-
 def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]:
     """Draw the longest free run of every test file into ``out/figures``."""
     from hybrid_mpc.plots.fit import benchmark_run
     from hybrid_mpc.plots.style import save
 
-    hybrid = results.model.hybrid
+    hybrid = results.hybrid
     chosen = "fitted prior" if hybrid == "phy" else hybrid.upper()
     made, prior = [], scenario.prior()
     units = [(signal.unit, scale) for signal, scale in scored_signals(prior.outputs, benchmark_of(scenario))]
@@ -594,7 +557,7 @@ def draw(scenario: Scenario, results: BenchmarkResults, out: Path) -> list[Path]
         drawn = {name: run.y_hat[m] for name, m in (("phy", "phy"), ("rnn", "rnn"), ("hybrid", hybrid))}
         figure = benchmark_run(
             run.t, run.y, drawn, run.u, outputs=prior.outputs, inputs=prior.inputs, units=units,
-            shown=SHOWN * time_unit(found.runs, results.model.dt),
+            shown=SHOWN * time_unit(found.runs, scenario.data.dt),
             title=f"{scenario.title}: free run over {file}", names={"hybrid": f"hybrid ({chosen})"},
         )  # fmt: skip
         made.append(save(figure, out / "figures" / f"{Path(file).stem}.png"))
@@ -616,9 +579,9 @@ def table(results: BenchmarkResults) -> list[str]:
                 lines.append(f"{'file':28} {'model':10} {'error [-]':>12} {heads}")
             cells = " ".join(f"{value:>{max(12, len(head))}.4g}" for head, value in by_output)
             lines.append(f"{file:28} {name:10} {found.error:>12.4g} {cells}")
-    lines += [f"no {name}: {why}" for name, why in results.model.no_linear.items()]
-    model, shares = results.model, {kind: results.model.choice.share(kind) for kind in results.model.kinds}
+    lines += [f"no {name}: {why}" for name, why in results.choice.no_linear.items()]
+    shares = {kind: results.choice.choice.share(kind) for kind in results.training.weights}
     lines += [
         f"{kind}: {100 * share:.0f} % of its correction" for kind, share in shares.items() if share != 1
     ]
-    return [*lines, f"hybrid: {model.hybrid}"]
+    return [*lines, f"hybrid: {results.hybrid}"]

@@ -33,8 +33,6 @@ from hybrid_mpc.scenario import Scenario
 Array = NDArray[np.float64]
 LONGEST = 60.0
 """Longest run in :attr:`Recordings.long` [time constants of the machine]; it is long enough to show drift."""
-SCORED = 50
-"""Smallest number of periods of a piece after its warm-up."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,8 @@ def _parts(dataset: Dataset, scenario: Scenario, uncut: bool) -> list[Trajectory
         runs = whole_runs(dataset, spec.valid_every) if uncut else dataset.trajectories
         return [p for t in runs for p in pieces(t, spec.piece)]
     parts = [p for t in dataset.whole for p in in_turn(t, spec, data.smoothing)]
-    shortest = data.warm_up + SCORED * data.dt
+    # smallest number of periods of a piece after its warm-up
+    shortest = data.warm_up + 50 * data.dt
     if any(len(p.t) * p.dt < shortest for p in parts):
         raise InputError(
             f"recordings: at least one is too short to be cut into {len(spec.cycle)} pieces of at least "
@@ -259,7 +258,7 @@ def run_freely(
     evaluated, or its first ``length`` [s]. Trajectories have the commanded inputs.
     """
     dt = trajectories[0].dt
-    warm = warm_samples(warm_up, fit.delay, dt)
+    warm = max(1, round(warm_up / dt) - lost_samples(fit.delay, dt))  # from the first known delayed input on
     starts = evaluation_trajectories(shifted(trajectories, fit.delay), fit.smoother(prior, dt), warm)
     if length is not None:
         n = warm + round(length / dt) + 1
@@ -329,16 +328,6 @@ def run_error(
     return output_errors(
         [scaled * run.y_hat[name] for run in runs], [scaled * run.y for run in runs], signals
     )
-
-
-def warm_samples(warm_up: float, delay: float, dt: float) -> int:
-    """Periods of the warm-up, from the first sample with a known delayed input on.
-
-    Example:
-        >>> warm_samples(1.225, 0.0, 0.025), warm_samples(1.225, 0.03, 0.025)
-        (49, 47)
-    """
-    return max(1, round(warm_up / dt) - lost_samples(delay, dt))
 
 
 def _padded(values: Array, length: int) -> Array:

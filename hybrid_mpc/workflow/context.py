@@ -13,13 +13,13 @@ import numpy as np
 from hybrid_mpc.compare.tasks import ready
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset, Trajectory, load_trajectories
-from hybrid_mpc.engine import Progress
+from hybrid_mpc.engine import WORKERS, Progress
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.folder import versions
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.parts import artifact_digest
-from hybrid_mpc.machine.specification import DataSpec, Role
+from hybrid_mpc.machine.specification import BenchmarkBudget, DataSpec, Role
 from hybrid_mpc.scenario import Budget, Scenario, load_scenario
 from hybrid_mpc.workflow.settings import RunSettings
 from hybrid_mpc.workflow.stage import Absent, Stage, Stored, read_stage, write_stage
@@ -41,6 +41,7 @@ class Context:
         progress: Where to report. Default: nowhere.
         cluster: Address of a dask scheduler or a ``distributed.Client``, which trains networks and runs loops.
             Default: processes of this machine.
+        workers: Number of kinds of networks that are trained at once. Default: 2.
         pictures: Figures that this process has drawn, by part of the report: section, file, caption.
     """
 
@@ -49,6 +50,7 @@ class Context:
     out: Path
     progress: Progress = field(default_factory=Progress)
     cluster: Any = field(default=None, repr=False, compare=False)
+    workers: int = field(default=WORKERS, repr=False, compare=False)
     pictures: dict[str, list[tuple[str, Path, str]]] = field(default_factory=dict, repr=False, compare=False)
     _read: dict[str, Stored[Any]] = field(default_factory=dict, repr=False, compare=False)
     _kits: dict[str, Kit] = field(default_factory=dict, repr=False, compare=False)
@@ -94,6 +96,20 @@ class Context:
                 f"choose one of: {', '.join(budgets)} [HM-WORKFLOW-017]"
             )
         return budgets[self.settings.budget]
+
+    @property
+    def effort(self) -> BenchmarkBudget:
+        """Effort of the training."""
+        return self.budget
+
+    @property
+    def fit_length(self) -> float | None:
+        """Length [s] of the longest free runs that the prior is fitted to: that of the runs that models are judged by.
+
+        None without validation and test recordings.
+        """
+        runs = (*self.trajectories("valid"), *self.trajectories("test"))
+        return self.spec.free_run or max(((len(t.t) - self.warm) * self.spec.dt for t in runs), default=None)
 
     @property
     def spec(self) -> DataSpec:

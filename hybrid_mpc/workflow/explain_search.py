@@ -33,9 +33,6 @@ from hybrid_mpc.workflow.explained import ExplainResult, FreeRuns, explained_nam
 from hybrid_mpc.workflow.stage import sources
 from nn_export.program import to_json
 
-SHOWN_LEFT = 5.0
-"""Remaining time [s] above which the progress text shows it."""
-
 
 def prior_class(scenario: Scenario) -> type[Prior]:
     """The class of a scenario's prior, which the search extends by terms.
@@ -244,7 +241,8 @@ class Search:
                 begun = now
             last = done
             left = (now - begun) / done * (total - done) if done > 0 else 0.0
-            more = f", about {left:.0f} s left of this step" if left > SHOWN_LEFT else ""
+            # remaining time [s] above which the progress text shows it
+            more = f", about {left:.0f} s left of this step" if left > 5.0 else ""
             self.context.progress.update(part, done, total, f"{text}{more}")
 
         return passed

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.engine import Progress
@@ -112,15 +111,11 @@ def usage(settings: RunSettings, out: Path) -> str:
     return shlex.join(["hybrid-mpc", "run", settings.scenario, *settings.options(str), *effort, *found])
 
 
-def best_settings(found: SearchResult, space: SearchSpace) -> dict[str, Any]:
-    """The best settings, as ``settings.json`` holds them."""
-    names = {"learning_rates" if name in RATES else name: None for name in space.names}
-    return {name: getattr(found.settings, name) for name in names}
-
-
 def _write(context: Context, settings: TuneSettings, found: SearchResult) -> None:
     """Settings, table, figures, and results.json last."""
-    out, names, best = context.out, settings.space.names, best_settings(found, settings.space)
+    out, names = context.out, settings.space.names
+    fields = dict.fromkeys("learning_rates" if name in RATES else name for name in names)
+    best = {name: getattr(found.settings, name) for name in fields}
     data = context.read(DATA)
     results = {
         "schema": "hybrid-mpc tune",

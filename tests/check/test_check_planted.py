@@ -76,7 +76,7 @@ class Plant(StatePlant):
         return np.array([state[0] + dt * v, v])
 
 
-BUDGET = {"quick": Budget(4, 1, 5, 5, 1)}
+BUDGET = {"quick": Budget(4, 1, 5, 5, seeds=1)}
 KETTLE = Scenario(
     "kettle", "Kettle", "", prior=Kettle, budgets=BUDGET,
     data=DataSpec("t", ("inflow", "heat"), ("level", "warmth"), dt=0.5, max_gap=2.0, smoothing=5.0, warm_up=5.0,
@@ -133,7 +133,7 @@ PLANTED = {
         "HM-MACHINE-008",
     ),
     "a disturbance without a column": (
-        lambda: replace(KETTLE, data=replace(KETTLE.data, disturbances=())), "HM-CHECK-016",
+        lambda: replace(KETTLE, data=replace(KETTLE.data, disturbances=())), "HM-DATA-129",
     ),
     "a column in a unit of something else": (
         lambda: replace(KETTLE, data=replace(KETTLE.data, outputs=("level [kg]", "warmth"))), "HM-DATA-128",
@@ -248,8 +248,8 @@ def test_errors_in_different_places_are_told_in_one_pass():
     problems = told(wrong)
     for word in (
         "'algebraic'", "corrects names levl", "did you mean 'disturbances'?", "range of warmth", "(x, u, w, p, t)",
-        "output(x, u, w, p) must give 2", "tuple of Balance", "columns of inputs", "is in 'furlong'",
-        "columns of disturbances", "task hold: x0", "control: q must have 2", "sensor_sigma: must have 2",
+        "output(x, u, w, p) must give 2", "tuple of Balance", "inputs has 1 column", "is in 'furlong'",
+        "disturbances has 0 columns", "task hold: x0", "control: q must have 2", "sensor_sigma: must have 2",
     ):  # fmt: skip
         assert sum(word in problem for problem in problems) == 1, (word, problems)
 
@@ -392,7 +392,7 @@ def test_a_user_s_file_with_seven_errors_has_seven_lines(call, tmp_path):
     assert "7 errors" in told_to_user
     for word in (
         "its derivative by x is not finite at x = [0.0]", "balance water [l/s]: dS/dt - supply + loss",
-        "operating_point is not an equilibrium", "2 columns of inputs", "sensor_sigma: must have 1 numbers",
+        "operating_point is not an equilibrium", "inputs has 2 columns", "sensor_sigma: must have 1 numbers",
         "HM-KIT-029", "task fill: x0 must have 1",
     ):  # fmt: skip
         assert sum(word in line for line in told_to_user.splitlines()) == 1, word

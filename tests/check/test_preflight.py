@@ -225,7 +225,7 @@ WRONG = {
         field(prior=type("Empty", (Prior,), {k: getattr(Tank, k) for k in ("states", "inputs", "outputs")})),
         "HM-CHECK-061",
     ),
-    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)), "HM-CHECK-016"),
+    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)), "HM-DATA-129"),
     # a mechanical prior
     "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), "HM-CHECK-049"),
     "no inertia": (prior(mass_matrix=MechanicalPrior.mass_matrix), "HM-CHECK-061"),
@@ -240,7 +240,7 @@ WRONG = {
     ),
     "three states": (prior(states=(*Pendulum.states, Signal("i", "A"))), "HM-MACHINE-001"),
     # data
-    "too few columns": (field(data=dataclasses.replace(DATA, inputs=())), "HM-CHECK-016"),
+    "too few columns": (field(data=dataclasses.replace(DATA, inputs=())), "HM-DATA-129"),
     "unknown cause": (field(causes={"mass": ("m",)}), "HM-CHECK-017"),
     # control
     "weights of too few": (field(control=OCP(10, (25,), (1,), (1,), (-1,), (1,))), "HM-CHECK-023"),

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from control_parts import plan_of
-from gated import gated
+from gated import gated, saturated
 from machines import AMBIENT, HEAT, dc_motor, rest_levels, thermal, two_tanks
 
 from hybrid_mpc import (
@@ -322,25 +322,9 @@ def test_a_period_searches_widely_once(monkeypatch):
     assert wide == [True] + [False] * 7
 
 
-def with_memory(seed, units=24):
-    """A tank with a wall, of whose rates a saturated memory of level and inflow takes a part."""
-    rng = np.random.default_rng(seed)
-    x, h, u = ca.MX.sym("x", 2), ca.MX.sym("h", units), ca.MX.sym("u", 2)
-    w_h = rng.normal(size=(units, units)) * 0.9 / np.sqrt(units)
-    w_x, out = 4.0 * rng.normal(size=(units, 4)), 0.2 * rng.normal(size=(2, units)) / np.sqrt(units)
-    h_next = ca.tanh(w_h @ h + w_x @ ca.vertcat(x, u) + rng.normal(size=units))
-    rate = ca.vertcat(u[0] - ca.sqrt(0.1 + x[0] ** 2), u[1] - u[0] * x[1]) + out @ h_next
-    levels = (Signal("level", "m", -2, 2), Signal("heat", "K", -2, 2))
-    return HybridModel.of(
-        "memory", 0.1, levels, (Signal("in", "m/s"), Signal("power", "K/s")), levels,
-        x=x, h=h, u=u, x_next=x + 0.02 * rate, h_next=h_next, xdot=rate, y=x,
-        nominal_x=(0.5, 0.5), nominal_u=(0.6, 0.4),
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_a_network_s_memory_is_brought_to_rest_on_the_way(seed):
-    model = with_memory(seed)
+    model = saturated(seed, 24)
     ocp = OCP(10, [0.0, 0.0], [0.1, 0.1], [0.1, 0.1], [-3.0, -3.0], [3.0, 3.0], q_y=[100.0, 100.0])
     targets = Targets(model, ocp)
     for goal in ([0.5, 0.5], [0.8, 0.3], [0.3, 0.9]):

@@ -9,7 +9,7 @@ from scipy.io import savemat
 from hybrid_mpc import DataSpec, InputError, Signal, Window, load_trajectories, write_csv
 from hybrid_mpc.data.excitation import short_runs
 from hybrid_mpc.data.recording import check_unit, read_recording
-from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.data.trajectories import Trajectory, hold_mean
 
 SPEC = DataSpec("t", ("tau",), ("phi",), dt=0.02, max_gap=0.05, smoothing=0.1, warm_up=0.2)
 SIGNALS = machine((Signal("phi", "rad"),), (Signal("torque", "N m"),))
@@ -29,6 +29,11 @@ def test_states_and_derivatives_of_a_known_motion(tmp_path):
     np.testing.assert_allclose(whole.xdot[inner, 1], -np.sin(whole.t)[inner], atol=2.5e-3)
     np.testing.assert_allclose(np.diff(whole.t), SPEC.dt, atol=1e-12)
     assert [piece.role for piece in data.trajectories] == ["train", "valid", "test"]
+
+
+def test_an_input_is_the_mean_of_its_hold_over_the_period_that_begins():
+    t, u = np.array([0.0, 0.25, 1.0, 2.0]), np.array([[1.0], [3.0], [-1.0], [0.0]])
+    assert hold_mean(t, u, np.array([0.0, 0.5, 1.0]), 0.5)[:, 0].tolist() == [2.0, 3.0, -1.0]
 
 
 def test_gap_cuts_and_nothing_leaks_across_it(tmp_path):

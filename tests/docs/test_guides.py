@@ -43,11 +43,6 @@ def executed(page, sources):
     return namespace
 
 
-def words(page):
-    """The words of a page, a blank between two."""
-    return " ".join((ROOT / page).read_text().split())
-
-
 @pytest.fixture(scope="module")
 def machines():
     """What the pages on priors and plants define."""
@@ -121,7 +116,7 @@ def test_every_prior_of_the_guide_passes_the_preflight(machines, tanks, name):
     check_scenario(scenario)
 
 
-def test_what_is_refused_is_refused_in_the_words_of_the_guide(machines, tanks):
+def test_a_root_without_a_floor_and_a_wrong_sign_of_a_supply_are_refused(machines, tanks):
     good, balance = machines["TwoTanks"], machines["Balance"]
 
     class Root(good):
@@ -133,9 +128,8 @@ def test_what_is_refused_is_refused_in_the_words_of_the_guide(machines, tanks):
             volume = p.area * (x.upper + x.lower)
             return (balance("volume", volume, -u.pump, self.flows(x, p)[1], "m^3", "m^3/s"),)
 
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError, match="HM-CHECK-051"):
         check_scenario(replace(tanks, prior=Root, plant=None, tasks=()))
-    assert str(told.value) in words("docs/checks.md")
     with pytest.raises(InputError, match="HM-CHECK-057"):
         check_scenario(replace(tanks, prior=Sign, plant=None, tasks=()))
 

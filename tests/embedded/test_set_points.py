@@ -8,7 +8,7 @@ import machines
 import numpy as np
 import pytest
 from embedded_parts import needs_compiler
-from gated import gated
+from gated import gated, saturated
 
 from hybrid_mpc import OCP, CondensedController, Disturbance, HybridModel, Signal, TrueState, with_input_delay
 from hybrid_mpc.embedded.native import NativeController
@@ -69,20 +69,9 @@ def restless():
     return model, OCP(9, [0.0], [1.0], [0.1], [-1.0], [1.0], q_y=[1.0], terminal=[[1.0]]), 0.3
 
 
-def memory(units=12, seed=1):
-    """A tank with a wall, of whose rates a saturated memory of level and inflow takes a part."""
-    rng = np.random.default_rng(seed)
-    x, h, u = ca.SX.sym("x", 2), ca.SX.sym("h", units), ca.SX.sym("u", 2)
-    w_h = rng.normal(size=(units, units)) * 0.9 / np.sqrt(units)
-    w_x, out = 4.0 * rng.normal(size=(units, 4)), 0.2 * rng.normal(size=(2, units)) / np.sqrt(units)
-    h_next = ca.tanh(w_h @ h + w_x @ ca.vertcat(x, u) + rng.normal(size=units))
-    rate = ca.vertcat(u[0] - ca.sqrt(0.1 + x[0] ** 2), u[1] - u[0] * x[1]) + out @ h_next
-    levels = (Signal("level", "m", -2, 2), Signal("heat", "K", -2, 2))
-    model = HybridModel.of(
-        "memory", 0.1, levels, (Signal("in", "m/s"), Signal("power", "K/s")), levels,
-        x=x, h=h, u=u, x_next=x + 0.02 * rate, h_next=h_next, xdot=rate, y=x,
-        nominal_x=(0.5, 0.5), nominal_u=(0.6, 0.4),
-    )  # fmt: skip
+def memory():
+    """A tank with a wall and a saturated memory."""
+    model = saturated(1, 12)
     ocp = OCP(
         15,
         [0.0, 0.0],

@@ -21,6 +21,7 @@ from hybrid_mpc import (
     replay,
 )
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.watch.diagnose import Window
 
 SIGMA, START = 0.02, 250
 """Deviation of the sensors [K], and the sample from which on something is broken."""
@@ -130,6 +131,23 @@ def test_something_else_is_not_taken_for_a_known_cause(limits):
     )
     (k, *_) = np.flatnonzero(trace.alarm)
     assert Diagnoser(model, limits).of_alarm(int(k), trace, run, estimates).startswith("none of the known")
+
+
+def test_samples_within_an_average_are_no_independent_evidence(limits):
+    model, run, start = bodies(), recording(START + 60, 7, sensor=(0.0, 1.0)), START - 60
+    # the truth at the start is not known to the test, but a fit of the first state finds it
+    window = Window(
+        run.y[start:], run.u[start:], run.w[start:], run.y[start], np.zeros(0), np.zeros(model.n_d), 60
+    )
+    sigma = {}
+    for short in (2, 8):
+        diagnoser = Diagnoser(model, limits)
+        diagnoser.short = short
+        (change,) = diagnoser.diagnose(window).causes
+        assert change.name == "offset of cold"
+        sigma[short] = change.sigma
+    # of 120 samples 60 and 15 are independent; the size of the change takes one
+    assert sigma[8] / sigma[2] == pytest.approx(np.sqrt((60 - 1) / (15 - 1)), rel=1e-6)
 
 
 def test_groups_of_parameters_and_strange_ones(limits):

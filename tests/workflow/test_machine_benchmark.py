@@ -1,6 +1,5 @@
 """``hybrid-mpc benchmark`` on a machine that is simulated here, and what it refuses."""
 
-import json
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -9,14 +8,22 @@ import numpy as np
 import pytest
 from cart import DELAY, TRUE, recording, written
 
-from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, Signal, fit_prior, load_scenario
+from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, Signal, fit_prior, load, load_scenario
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import shifted
+from hybrid_mpc.identify.predict import predict
 from hybrid_mpc.workflow import benchmark as job_benchmark
-from hybrid_mpc.workflow.benchmark import BenchmarkSettings, benchmark, load_model, training_settings
+from hybrid_mpc.workflow.benchmark import (
+    BenchmarkContext,
+    BenchmarkSettings,
+    benchmark,
+    read_benchmark,
+)
 from hybrid_mpc.workflow.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
-from hybrid_mpc.workflow.stages.identify import load_trained
+from hybrid_mpc.workflow.predict import read_recordings_of
+from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stages.identify import trained_models, training_settings
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +41,12 @@ def made(machine, jobs_here, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "run"
     settings = BenchmarkSettings(str(scenario), (train,), (test,))
     return out, benchmark(settings, out)
+
+
+def context_of(machine, out):
+    """The results of a benchmark's stages."""
+    settings = RunSettings(str(machine[0]), (machine[1],))
+    return BenchmarkContext(settings, load_scenario(str(machine[0])), out)
 
 
 def test_the_delay_and_the_parameters_are_found(machine):
@@ -64,9 +77,9 @@ def test_a_test_file_is_judged_after_what_is_given_and_on_nothing_before(machine
     share = np.sqrt(np.mean(error**2)) / np.std(1e3 * run.y)
     assert row.errors["phy"].error == pytest.approx(share)
     assert row.errors["phy"].fit_percent == {"s [mm]": pytest.approx(100 * (1 - share))}
-    written = json.loads((out / "results.json").read_text())
-    assert written["test"]["test.csv"]["phy"] == vars(row.errors["phy"])
-    assert written["data"]["seconds"]["train"] > written["data"]["seconds"]["valid"] > 0
+    written = read_benchmark(out / "results.json")
+    assert written.test["test.csv"].errors == row.errors
+    assert written.data.seconds["train"] > written.data.seconds["valid"] > 0
 
 
 def test_a_file_is_judged_by_all_runs_that_fit_in(machine, made, tmp_path):
@@ -86,20 +99,22 @@ def test_linear_baselines_run_over_the_same_samples(machine, made):
     row = made[1].test["test.csv"]
     run, scenario = row.runs[0], load_scenario(str(machine[0]))
     (whole,) = read_test(scenario, machine[2])
-    for name, model in made[1].model.linear.items():
+    for name, model in made[1].choice.linear.items():
         (y_hat,) = model.free_runs(
             [whole], len(whole.t) - len(run.t)
         )  # what is given ends before the first that counts
         np.testing.assert_array_equal(run.y_hat[name], y_hat)
         assert np.array_equal(whole.y[-len(run.t) :], run.y)
         assert 0 < row.errors[name].error < 0.5  # the cart is linear but for its cubic spring
-    document = json.loads((made[0] / "results.json").read_text())
-    assert document["model"]["baselines"]["ARX"]["chosen"].startswith("order ")
+    assert read_benchmark(made[0] / "results.json").choice.linear["ARX"].chosen.text.startswith("order ")
 
 
 def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_path):
-    scenario, model = load_scenario(str(machine[0])), load_model(made[0], "cart")
-    prior = scenario.prior(model.fit.values)
+    scenario, model = load_scenario(str(machine[0])), made[1]
+    prior, networks = (
+        scenario.prior(model.prior.fit.values),
+        context_of(machine, made[0]).networks(model.choice),
+    )
     lines = machine[2].read_text().splitlines()
     # from the 12th sample on, the measured position is something else; time and input are as they were
     changed = [*lines[:12], *(",".join([*line.split(",")[:2], "0.5"]) for line in lines[12:])]
@@ -108,12 +123,12 @@ def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_pat
     found = [
         run_freely(
             prior,
-            model.fit,
-            model.networks,
+            model.prior.fit,
+            networks,
             read_test(scenario, path),
             warm_up=1.0,
             length=None,
-            linear=model.linear,
+            linear=model.choice.linear,
         )[0]
         for path in (machine[2], tmp_path / "changed.csv")
     ]
@@ -124,12 +139,12 @@ def test_nothing_after_the_warm_up_is_known_to_a_free_run(machine, made, tmp_pat
 
 
 def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(made):
-    model = made[1].model
+    model = made[1].choice
     validation, long = model.validation, model.long
     names = ("phy", "pgrnn", "mopgrnn")
     worse = {n: max(part[n].error / part["phy"].error for part in (validation, long)) for n in names}
     able = ("phy", *model.choice.sure)
-    assert model.hybrid == min((n for n in names if n.partition(" ")[0] in able), key=worse.get)
+    assert made[1].hybrid == min((n for n in names if n.partition(" ")[0] in able), key=worse.get)
     assert set(model.choice.sure) == {
         n for n, own in model.choice.candidates.items() if n != "phy" and own.upper < 1
     }
@@ -138,21 +153,20 @@ def test_the_recommended_model_is_best_on_validation_and_on_runs_of_full_length(
 @pytest.mark.full
 def test_a_share_of_a_correction_is_kept_judged_and_told(machine, made, tmp_path, monkeypatch):
     scenario, train, test = machine
-    out, recommend = tmp_path / "half", job_benchmark.recommend
+    out, whole_choice = tmp_path / "half", job_benchmark.choice_stage
     shutil.copytree(made[0], out)
-    shutil.rmtree(out / "model")
+    (out / "checkpoints" / "choice.json").unlink()
 
-    def half(errors, **given):
-        found = recommend(errors, **given)
-        own = replace(found.candidates["mopgrnn"], share=0.5)
-        return replace(found, candidates={**found.candidates, "mopgrnn": own}, sure=("mopgrnn",))
+    def half(context):
+        found = whole_choice(context)
+        own = replace(found.choice.candidates["mopgrnn"], share=0.5)
+        candidates = {**found.choice.candidates, "mopgrnn": own}
+        return replace(found, choice=replace(found.choice, candidates=candidates, sure=("mopgrnn",)))
 
-    monkeypatch.setattr(job_benchmark, "recommend", half)
+    monkeypatch.setattr(job_benchmark, "choice_stage", half)
     results = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
-    whole, kept = (
-        load_trained(out / "checkpoints", "mopgrnn"),
-        load_model(out / "model", "cart").networks["mopgrnn"],
-    )
+    context = context_of(machine, out)
+    whole, kept = trained_models(context, "mopgrnn"), context.networks(results.choice)["mopgrnn"]
     for name, weight in whole.weights.items():
         np.testing.assert_array_equal(
             kept.weights[name], (0.5 if name in ("w_out", "b_out") else 1.0) * weight
@@ -163,10 +177,26 @@ def test_a_share_of_a_correction_is_kept_judged_and_told(machine, made, tmp_path
     assert "mopgrnn: 50 % of its correction" in job_benchmark.table(results)
 
 
-def test_networks_are_trained_with_what_the_budget_says():
+def test_networks_are_trained_with_what_the_budget_says(machine, tmp_path):
     budget = BenchmarkBudget(4, 2, teacher_steps=5, free_run_steps=5, horizon=10, decay=7.0, prior_replay=3.0)
-    settings = training_settings("pgrnn", budget, seed=1, warm=4)
-    assert (settings.decay, settings.prior_replay, settings.seed, settings.warm) == (7.0, 3.0, 1, 4)
+    scenario = load_scenario(str(machine[0]))
+    scenario = replace(scenario, benchmark=replace(scenario.benchmark, budgets={"own": budget}))
+    context = BenchmarkContext(RunSettings("cart", seed=1, budget="own"), scenario, tmp_path)
+    settings = training_settings(context, "pgrnn")
+    for name, value in vars(budget).items():
+        assert getattr(settings, name) == value
+    assert (settings.seed, settings.warm, settings.parts) == (1, 10, 4)
+
+
+def test_a_benchmark_leaves_a_kit_that_predicts(machine, made):
+    kit = load(made[0])
+    assert set(kit.models) >= {"prior", "hybrid"}
+    assert kit.provenance.scenario == "cart"
+    (recording,), _ = read_recordings_of(kit, [machine[2]])
+    free = predict(kit, recording, "prior").free_run
+    assert 1e3 * free.rmse["s [m]"] == pytest.approx(
+        made[1].test["test.csv"].errors["phy"].rmse["s [mm]"], rel=0.1
+    )
 
 
 @pytest.mark.full
@@ -174,16 +204,17 @@ def test_a_model_made_before_gives_the_same_figures_and_an_interrupted_run_goes_
     scenario, train, test = machine
     out, results = made
     again = benchmark(BenchmarkSettings(str(scenario), test=(test,), model=out), tmp_path / "again")
-    found, before = again.test["test.csv"].errors, results.test["test.csv"].errors
-    for name in before:
-        if name in results.model.linear:  # its matrices lie in memory otherwise: sums in another order
-            assert found[name].error == pytest.approx(before[name].error, rel=1e-9)
-        else:
-            assert found[name] == before[name]
-    (out / "checkpoints" / "pgrnn.json").unlink()  # as if it had been killed before this was written
-    (out / "checkpoints" / "pgrnn.npz").unlink()
+    folder = out / "checkpoints" / "training" / results.training.folder
+    (folder / "pgrnn.json").unlink()  # as if it had been killed before this was written
+    (folder / "pgrnn.npz").unlink()
     resumed = benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), out)
-    assert resumed.test["test.csv"].errors == results.test["test.csv"].errors
+    before = results.test["test.csv"].errors
+    for found in (run.test["test.csv"].errors for run in (again, resumed)):
+        for name in before:
+            if name in results.choice.linear:  # its matrices lie in memory otherwise: sums in another order
+                assert found[name].error == pytest.approx(before[name].error, rel=1e-9)
+            else:
+                assert found[name] == before[name]
 
 
 def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp_path):
@@ -191,8 +222,7 @@ def test_a_changed_machine_is_known_again_after_a_few_seconds(machine, made, tmp
     changed = recording(tmp_path / "changed.csv", seed=2, seconds=40.0, k=7.0)
     settings = BenchmarkSettings(str(scenario), test=(changed,), model=made[0], refit=10.0)
     found = benchmark(settings, tmp_path / "judged").test["changed.csv"].refit
-    values = {row["parameter"]: row["fitted"] for row in found.prior}
-    assert 7.0 < values["k"] < 7.75  # the cubic spring counts as at most 3 * 0.5 * 0.7^2 more
+    assert 7.0 < found.values["k"] < 7.75  # the cubic spring counts as at most 3 * 0.5 * 0.7^2 more
     for name in ("phy", "hybrid"):
         assert found.after[name].rmse["s [mm]"] < 0.25 * found.before[name].rmse["s [mm]"]
     with pytest.raises(InputError, match="HM-WORKFLOW-012"):

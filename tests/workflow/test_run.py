@@ -16,7 +16,6 @@ from patience import HANGS
 
 from hybrid_mpc import InputError, load
 from hybrid_mpc.kit.parts import (
-    BENCHMARK_NOTE,
     KIT,
     OWNERS,
     PROGRAMS,
@@ -226,11 +225,3 @@ def test_the_folder_alone_is_monitored(call, machine, finished, tmp_path):
     code, _, error = call("monitor", bare, machine / "monday.csv", "--out", tmp_path / "none")
     assert code == 2
     assert "--scenario" in error
-
-
-def test_a_benchmark_s_folder_is_told_from_an_artifact(tmp_path):
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / BENCHMARK_NOTE).write_text("{}")
-    for folder in (tmp_path, tmp_path / "model"):
-        with pytest.raises(InputError, match="HM-KIT-037"):
-            load(folder)

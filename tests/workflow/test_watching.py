@@ -1,14 +1,16 @@
 """The table of all that watches: channels with thresholds, false alarms with intervals, faults with delays."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
-from hybrid_mpc import ChannelLimit, WatchLimits
+from hybrid_mpc import ChannelLimit, InputError, WatchLimits, load_scenario
 from hybrid_mpc.kit.parts import WatchFile
 from hybrid_mpc.watch.readings import Channel
-from hybrid_mpc.workflow.stages.report import _watch_tables
-from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
+from hybrid_mpc.workflow.stages.report import _watch_tables, _watch_words
+from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult, rates
 from hybrid_mpc.workflow.stages.watching import rate_words, watching_table
 
 LIMITS = WatchLimits(
@@ -57,3 +59,25 @@ def test_the_interval_of_a_count():
     assert rate_words(1, 3600.0) == "1 (0.025 to 5.6)"
     assert rate_words(0, 0.0) == "not watched"
     assert np.isclose(CleanAlarms(HOUR, 2).expected(2.0), 2.0)
+
+
+def test_a_scenario_sets_the_rates_of_false_alarms():
+    scenario = load_scenario("golf_robot")
+    own, slow = replace(scenario, false_alarms_per_hour=(0.01, 0.1)), SimpleNamespace(time_unit=10.0)
+    assert rates(own, slow) == (0.01, 0.1)
+    assert rates(scenario, slow) == (0.1, 0.2, 0.5, 1.0)
+    for bad in ((1.0, 1.0), (2.0, 1.0), (0.0, 1.0), (-1.0,)):
+        with pytest.raises(InputError, match=r"false_alarms_per_hour.*HM-"):
+            replace(scenario, false_alarms_per_hour=bad)
+
+
+def test_the_report_names_a_rate_that_the_data_are_too_short_for():
+    rated = replace(LIMITS, rated=True, false_alarms_per_hour=0.1)
+    found = replace(
+        FOUND,
+        watch={"prior": WatchFile({"residuals": rated})},
+        sources={"residuals": "recordings"},
+        wanted=0.01,
+    )
+    assert "0.01 an hour" in _watch_words(found)[0]
+    assert "too short" not in _watch_words(replace(found, wanted=0.1))[0]

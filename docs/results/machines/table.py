@@ -13,18 +13,42 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_mpc.files import read_json, write_json
+from hybrid_mpc.records import plain
+from hybrid_mpc.workflow.benchmark import read_benchmark
 
 HERE = Path(__file__).parent
 IMAGES = HERE.parents[1] / "images"
 MODELS = ("phy", "rnn", "pgrnn", "mopgrnn", "hybrid")
 LINEAR = ("ARX", "N4SID")
-DROPPED = ("timing", "versions")
 
 
 def take(folder: Path, name: str) -> None:
-    """Copy a folder's results here and its figures to docs/images."""
-    results = read_json(folder / "results.json")
-    write_json(HERE / f"{name}.json", {k: v for k, v in results.items() if k not in DROPPED})
+    """Write the results that the tables need here, and copy the figures to docs/images."""
+    found = read_benchmark(folder / "results.json")
+    fit, nominal = found.prior.fit, found.prior.nominal
+    kept = {
+        "schema": 3,
+        "budget": found.budget,
+        "seed": found.seed,
+        "data": found.data,
+        "warnings": found.warnings,
+        "model": {
+            "prior": [
+                {
+                    "parameter": name, "unit": found.prior.units[name], "nominal": nominal[name], "fitted": value,
+                    "standard_error": fit.standard_errors.get(name),
+                }
+                for name, value in fit.values.items()
+            ],
+            "delay_s": fit.delay,
+            "hybrid": found.hybrid,
+            "choice": found.choice.choice,
+            "validation": found.choice.validation,
+            "long": found.choice.long,
+        },
+        "test": {file: {**own.errors, "scored_s": own.scored_s} for file, own in found.test.items()},
+    }  # fmt: skip
+    write_json(HERE / f"{name}.json", plain(kept))
     for path in sorted((folder / "figures").glob("*.png")):
         stem = path.stem.replace(" ", "_")
         shutil.copyfile(path, IMAGES / f"machine_{name}_{stem}.png")

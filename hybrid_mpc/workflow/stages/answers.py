@@ -19,10 +19,6 @@ from hybrid_mpc.workflow.stages.watch import WatchResult
 SAFE = (STRUCTURE, "no offset", "step time", "stability margins", "limits")
 """Promises that must not be open if the controller is to be called safe."""
 SHOWN_OUTPUTS = 3
-TOUCHED = 1e-6
-"""Relative overshoot of a limit that counts as rounding."""
-FEW_FALLBACKS = 0.01
-"""Largest share of periods with fallback inputs that raises no doubt."""
 
 
 def answer_all(results: Results) -> tuple[Answer, Answer, Answer]:
@@ -131,12 +127,14 @@ def _loop_lines(results: Results) -> Iterator[tuple[str, bool]]:
     used = [(share, limit, task) for task, cell in own.items() for limit, share in cell.limits.items()]
     if used:
         share, limit, task = max(used)
-        over = share > 1.0 + TOUCHED
+        # relative overshoot of a limit that counts as rounding
+        over = share > 1.0 + 1e-6
         words = f"violated by {100 * (share - 1):.2g} %" if over else "kept"
         yield f"Limits: {words}. Most used: {limit}, {100 * share:.0f} % of its limit in {task}.", over
     fallback, task = max((1.0 - cell.sources["MPC"], task) for task, cell in own.items())
     words = f"Fallback inputs: {100 * fallback:.2g} % of the periods of {task}."
-    yield words if fallback else "No fallback input was needed.", fallback > FEW_FALLBACKS
+    # largest share of periods with fallback inputs that raises no doubt
+    yield words if fallback else "No fallback input was needed.", fallback > 0.01
 
 
 def _time_lines(found: ControlResult | Absent) -> Iterator[tuple[str, bool]]:

@@ -52,8 +52,6 @@ Array = NDArray[np.float64]
 BASELINES = ("prior", "prior_observer")
 REPORTED = {"prior": "prior_observer", "hybrid": "hybrid_observer", "oracle": "oracle"}
 """Controllers behind three short names: all with the same kind of estimator."""
-TIMED_PERIODS = 1000
-"""Periods timed on recordings if the scenario has no plant; enough for a 99th percentile."""
 TIMED = OBSERVERS
 """Controllers whose first seed runs alone on the machine, so that the durations of its steps count."""
 
@@ -296,7 +294,8 @@ def decided(cells: Mapping[str, Sequence[LoopRow]], most: int) -> bool:
 
 def _only_timing(context: Context) -> ControlResult:
     kit, whole = context.kit, context.dataset.whole
-    most = max(2, TIMED_PERIODS // len(whole))
+    # periods timed on recordings if the scenario has no plant; enough for a 99th percentile
+    most = max(2, 1000 // len(whole))
     controller, estimator, durations = kit.controller(), kit.observer(), []
     for i, recording in enumerate(whole):
         context.progress.update("recordings", i, len(whole), f"timing on {recording.name}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -54,6 +54,7 @@ from hybrid_mpc.identify.step import PriorStep, Scaling
 from hybrid_mpc.identify.structure import causes, causes_of_refusal, named
 from hybrid_mpc.identify.train import Trained, TrainingFailure, train
 from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.specification import BenchmarkBudget
 from hybrid_mpc.records import beside, plain, record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.workflow.context import Context
@@ -258,7 +259,7 @@ def doubts(context: Context) -> tuple[str, ...]:
         return found
     return (
         *found,
-        *short_runs(context.spec, context.trajectories("test")),
+        *short_runs(context.scenario.data, context.trajectories("test")),
         *check_excitation(train, inputs=prior.inputs, outputs=prior.outputs, parameters=free),
     )
 
@@ -303,9 +304,7 @@ def examined_prior(context: Context) -> PriorResult:
     """
     make, spec = context.scenario.prior, context.spec
     train, valid, test = (context.trajectories(role) for role in ("train", "valid", "test"))
-    longest = spec.free_run or max(
-        ((len(t.t) - context.warm) * spec.dt for t in (*valid, *test)), default=None
-    )
+    longest = context.fit_length
     try:
         fit = fit_prior(
             make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay,
@@ -327,7 +326,7 @@ def examined_prior(context: Context) -> PriorResult:
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     unseen = every[len(train) + len(valid) :]
-    judge, linear = _Judge(context, fitted, fit, smoother), _linear_models(context)
+    judge, linear = _Judge(context, fitted, fit, smoother), linear_models(context)
     longest_run = spec.free_run
     errors, baselines = judge.errors(unseen, longest_run, linear)
     growth: tuple[str, ...] = ()
@@ -398,7 +397,7 @@ def _error_of(baseline: BaselineScores) -> float:
     return math.inf if baseline.errors is None else baseline.errors.error
 
 
-def _linear_models(context: Context) -> dict[str, LinearModel | str]:
+def linear_models(context: Context) -> dict[str, LinearModel | str]:
     """Linear input-output models by name, or why the model is missing."""
     train, valid = context.trajectories("train"), context.trajectories("valid")
     found: dict[str, LinearModel | str] = {}
@@ -488,6 +487,7 @@ def training_stage(context: Context) -> TrainingResult:
         {kind: _as_long_as_judged(context, kind) for kind in kinds_of(context.scenario.prior())},
         folder.resolve(),
         device=context.settings.device,
+        workers=context.workers,
         on_progress=context.progress.update,
         cluster=context.cluster,
     )
@@ -588,18 +588,14 @@ def runs_of(
 
 def training_settings(context: Context, kind: str) -> TrainingSettings:
     """Training settings of a kind: those of the budget, replaced by those of the run's settings file."""
-    b = context.budget
+    effort = context.effort
+    own = {f.name: getattr(effort, f.name) for f in fields(BenchmarkBudget)}
     settings = TrainingSettings(
         kind=kind,  # type: ignore[arg-type]
-        hidden=b.hidden,
-        networks=b.networks,
-        teacher_steps=b.teacher_steps,
-        free_run_steps=b.free_run_steps,
         seed=context.settings.seed,
         warm=context.warm,
-        decay=b.decay,
-        prior_replay=b.prior_replay,
-        parts=max(PARTS, b.networks),
+        parts=max(PARTS, effort.networks),
+        **own,
     )
     return replace(settings, **context.settings.network())
 

@@ -40,10 +40,9 @@ from hybrid_mpc.workflow.stages.identify import (
     training_settings,
 )
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
-from hybrid_mpc.workflow.stages.promises import PromisesResult
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect, write_results
 from hybrid_mpc.workflow.stages.track import TrackResult
-from hybrid_mpc.workflow.stages.watch import RATES, WatchedRecording, WatchResult
+from hybrid_mpc.workflow.stages.watch import WatchedRecording, WatchResult
 from hybrid_mpc.workflow.stages.watching import watching_table
 
 TITLES: Mapping[str, str] = {
@@ -62,6 +61,7 @@ TITLES: Mapping[str, str] = {
     "analysis": "Linear analysis",
     "glossary": "Names and definitions",
 }
+FADED = "Training penalized the network's correction far away from all recordings"
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,8 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         "export": [_export_table(results.export)],
     }
     if not isinstance(results.promises, Absent):
-        tables["promises"] = [_promises_table(results.promises)]
+        rows = [(one.name, one.verdict, one.evidence, one.remedy) for one in results.promises.rows]
+        tables["promises"] = [Table(("promise", "verdict", "evidence", "what to do"), rows)]
     if (loops := closed_loops(results.control)) is not None:
         tables["control"] = [
             _control_table(loops),
@@ -230,8 +231,9 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     )
     replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
     lacking = "mopgrnn" not in models_of(context.scenario.prior())
-    after["training"] = ((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()) + _prior_replay_text(
-        replay
+    after["training"] = (
+        *((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()),
+        *((f"{FADED} (prior_replay, weight {replay:g}).",) if replay else ()),
     )
     if context.prior.fit.warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
@@ -279,7 +281,7 @@ def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
     if isinstance(found, Absent) or found.limits is None or found.clean is None:
         return (f"The monitor was not examined: {found.reason.rstrip('.')}.",)
     limits, clean = found.limits, found.clean
-    rate, wanted = limits.false_alarms_per_hour, RATES[0] / limits.time_unit
+    rate, wanted = limits.false_alarms_per_hour, found.wanted
     learned = f"Limits were learned from {found.sources[found.kind]}: {limits.words}."
     if not limits.rated:
         learned = (
@@ -299,11 +301,6 @@ def _watch_words(found: WatchResult | Absent) -> tuple[str, ...]:
             "the model is less accurate outside the range of the loops.",
         )
     return words
-
-
-def _prior_replay_text(weight: float) -> tuple[str, ...]:
-    words = "Training penalized the network's correction far away from all recordings"
-    return (f"{words} (prior_replay, weight {weight:g}).",) if weight else ()
 
 
 def coverage_words(recordings: Sequence[WatchedRecording]) -> tuple[str, ...]:
@@ -441,11 +438,6 @@ def _by(values: Mapping[str, float], label: str) -> float | None:
 
 def _percent(value: float, base: float | None) -> str:
     return f"{100 * (value / base - 1):+.0f} %" if base and math.isfinite(value) else "–"
-
-
-def _promises_table(found: PromisesResult) -> Table:
-    rows = [(one.name, one.verdict, one.evidence, one.remedy) for one in found.rows]
-    return Table(("promise", "verdict", "evidence", "what to do"), rows)
 
 
 def _export_table(export: ExportResult) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import read_object, write_json
@@ -33,6 +33,7 @@ from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult
 from hybrid_mpc.workflow.stages.track import TRACK, TrackResult
 from hybrid_mpc.workflow.stages.watch import WATCH, WatchResult
 
+R = TypeVar("R")
 SCHEMA_VERSION = 12
 SHOWN: tuple[Stage[Any], ...] = (
     DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, TRACK, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION,
@@ -113,10 +114,19 @@ def read_results(path: Path) -> Results:
     Example:
         ``read_results(Path("runs/mine/results.json")).choice.choice.recommended``
     """
+    return read_as(Results, SCHEMA_VERSION, path, "the run")
+
+
+def read_as(kind: type[R], version: int, path: Path, command: str) -> R:
+    """Read a ``results.json`` of this kind and version; ``command`` writes it.
+
+    Raises:
+        InputError: If the file is missing, damaged, or of another version.
+    """
     document = read_object(path)
-    if (version := document.get("schema_version")) != SCHEMA_VERSION:
+    if (found := document.get("schema_version")) != version:
         raise InputError(
-            f"{path}: schema_version is {str(version)[:20]}, but this version reads {SCHEMA_VERSION}. Write the file "
-            "again: hybrid-mpc run SCENARIO --out FOLDER --resume [HM-WORKFLOW-040]"
+            f"{path}: schema_version is {str(found)[:20]}, but this version reads {version}. Write the file again: "
+            f"repeat the command of {command} (of a run with --resume) [HM-WORKFLOW-040]"
         )
-    return record(Results, document, str(path))
+    return record(kind, document, str(path))

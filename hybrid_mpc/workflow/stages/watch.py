@@ -21,6 +21,7 @@ from hybrid_mpc.kit.parts import WatchFile, read_parts, write_watch
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import beside
 from hybrid_mpc.rules import counted, two_digits
+from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
 from hybrid_mpc.watch.explain import begun, explained
@@ -40,8 +41,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 RATES = (1.0, 2.0, 5.0, 10.0)
-"""False alarm rates [per hour, scaled with the time unit by :func:`rates`]; limits are learned for
-the first rate that the nominal data are long enough for."""
+"""Default rates of false alarms [per hour, over the machine's time unit in seconds], see :func:`rates`."""
 NOMINAL = ("train", "valid", "nominal")
 """Roles of undisturbed parts of recordings."""
 HELD: tuple[str, ...] = ("valid", "nominal")
@@ -63,14 +63,14 @@ KEPT = ("t", "values", "levels", "share", "on", "frozen", "alarm")
 NO_PROBLEM = "the scenario defines no control problem, which gives the monitor's estimator input range and sensor noise"
 
 
-def rates(model: HybridModel) -> tuple[float, ...]:
-    """The rates of ``RATES`` on the machine of a model [1/h].
+def rates(scenario: Scenario, model: HybridModel) -> tuple[float, ...]:
+    """Wanted rates of false alarms [1/h], the least first: the scenario's, or :data:`RATES` on the model's machine.
 
     Example:
-        >>> rates(SimpleNamespace(time_unit=10.0))
+        >>> rates(SimpleNamespace(false_alarms_per_hour=()), SimpleNamespace(time_unit=10.0))
         (0.1, 0.2, 0.5, 1.0)
     """
-    return tuple(rate / model.time_unit for rate in RATES)
+    return scenario.false_alarms_per_hour or tuple(rate / model.time_unit for rate in RATES)
 
 
 @dataclass(frozen=True)
@@ -224,6 +224,7 @@ class WatchResult:
         faults: Loops with a fault; None if none were run.
         faults_reason: Why no loops with a fault were run. Default: empty, they were run.
         shown: Names of the recordings whose traces are kept.
+        wanted: The least wanted rate of false alarms [1/h].
         arrays: Traces, see :func:`read_trace`.
     """
 
@@ -240,6 +241,7 @@ class WatchResult:
     faults: tuple[FaultedLoop, ...] | None = None
     faults_reason: str = ""
     shown: tuple[str, ...] = ()
+    wanted: float = RATES[0]
     arrays: Mapping[str, Array] = beside()
 
     @property
@@ -296,7 +298,9 @@ def watch_stage(context: Context) -> WatchResult | Absent:
     write_watch(context.out / "model", watch)
     kit = context.kit
     kind = ENERGY if energy else RESIDUALS
-    found = WatchResult(watch, kind, sources, loops=() if loops is None or not energy else loops.loops)
+    wanted = rates(scenario, kit.models[kit.recommended])[0]
+    used = () if loops is None or not energy else loops.loops
+    found = WatchResult(watch, kind, sources, loops=used, wanted=wanted)
     if found.limits is None:
         return replace(found, reason=watch[kit.recommended].reason)
     found = _on_recordings(context, kit, found)
@@ -339,8 +343,8 @@ def _learned(
             traces[id(record)] = replay(monitor, estimator, record, on_progress=say)
         own = [traces[id(record)] for record in data.records]
         limits = limits_of(
-            readings, [r.y for r in data.records], own, false_alarms_per_hour=rates(model), nominal=data.masks,
-            resolution=resolution, data_hash=data.data_hash,
+            readings, [r.y for r in data.records], own, false_alarms_per_hour=rates(context.scenario, model),
+            nominal=data.masks, resolution=resolution, data_hash=data.data_hash,
         )  # fmt: skip
         return limits, data.source
 
@@ -520,6 +524,10 @@ def inside(context: Context, recording: Trajectory, roles: tuple[str, ...]) -> N
 
 WATCH = Stage(
     "watch", "learning the monitor's limits", WatchResult, watch_stage,
-    lambda context: {**what_loops_read(context), "causes": context.scenario.causes}, (DATA, EXPORT, NOISE),
+    lambda context: {
+        **what_loops_read(context), "causes": context.scenario.causes,
+        "wanted rates of false alarms": context.scenario.false_alarms_per_hour,
+    },
+    (DATA, EXPORT, NOISE),
     optional=True, restore=put_limits,
 )  # fmt: skip
