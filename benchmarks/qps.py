@@ -34,8 +34,8 @@ from parts import arguments, report
 
 import hybrid_mpc as hm
 from hybrid_mpc.control import qp as controls
-from hybrid_mpc.control.active_set import ActiveSet, RowQP
 from hybrid_mpc.loop.simulate import Step
+from hybrid_mpc.model.active_set import ActiveSet, RowQP
 
 STORE = Path(__file__).with_suffix(".npz")
 FIELDS = ("h", "g", "a", "lower", "upper", "linear", "give", "start", "later", "earlier")

@@ -65,6 +65,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.estimate.kalman import (
         Estimate as Estimate, ExtendedKalmanFilter as ExtendedKalmanFilter, TrueState as TrueState,
     )
+    from hybrid_mpc.estimate.moving_horizon import MovingHorizonEstimator as MovingHorizonEstimator
     from hybrid_mpc.estimate.offset_free import OffsetFree as OffsetFree, offset_free as offset_free
     from hybrid_mpc.estimate.parameters import (
         parameter_factors as parameter_factors, parameter_filter as parameter_filter,
@@ -75,6 +76,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
         TrackedParameter as TrackedParameter, TrackingFilter as TrackingFilter,
     )
     from hybrid_mpc.estimate.tuning import process_noise as process_noise
+    from hybrid_mpc.estimate.unscented import UnscentedKalmanFilter as UnscentedKalmanFilter
     from hybrid_mpc.files import write_arrays as write_arrays
     from hybrid_mpc.identify.ahead import errors_ahead as errors_ahead
     from hybrid_mpc.identify.evaluate import (
@@ -206,6 +208,7 @@ _ROOMS = {
     "errors": ("InputError", "SafeInputError"),
     "estimate.delay": ("DelayCompensation",),
     "estimate.kalman": ("Estimate", "ExtendedKalmanFilter", "TrueState"),
+    "estimate.moving_horizon": ("MovingHorizonEstimator",),
     "estimate.offset_free": ("OffsetFree", "offset_free"),
     "estimate.parameters": (
         "parameter_factors", "parameter_filter", "parameter_states", "with_parameter_states",
@@ -213,6 +216,7 @@ _ROOMS = {
     "estimate.switching": ("SwitchingFilter",),
     "estimate.tracking": ("TrackedParameter", "TrackingFilter"),
     "estimate.tuning": ("process_noise",),
+    "estimate.unscented": ("UnscentedKalmanFilter",),
     "files": ("write_arrays",),
     "identify.ahead": ("errors_ahead",),
     "identify.evaluate": ("evaluation_trajectories", "free_runs", "score"),

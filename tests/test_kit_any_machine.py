@@ -8,6 +8,7 @@ from machines import MachinePlant
 import hybrid_mpc as hm
 from hybrid_mpc.compare.loops import LoopSpec, excess, limits_used, row_of
 from hybrid_mpc.compare.tasks import repeated
+from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.kit.parts import WatchFile, loop_settings, set_limits
 from hybrid_mpc.workflow import monitor as monitor_job
@@ -87,6 +88,28 @@ def test_a_loop_from_the_kit_is_without_offset(kit):
     assert excess(OCP, result, model)["pump [m^3/s]"] == 0.0
     table = result.to_pandas(model)
     assert {"d rate lower", "w inflow [m^3/s]", "y_ref lower [m]"} <= set(table)
+
+
+@pytest.mark.parametrize(
+    ("kind", "own"),
+    [("ekf", hm.ExtendedKalmanFilter), ("ukf", hm.UnscentedKalmanFilter), ("mhe", hm.MovingHorizonEstimator)],
+)
+def test_a_loop_with_another_kind_of_observer_is_without_offset(kit, kind, own):
+    model, observer = kit.models["prior"], kit.observer(kind=kind)
+    assert type(observer) is own
+    plant = MachinePlant(model, load=1e-5)
+    result = hm.simulate(
+        plant, observer, kit.controller(), [0.4], dt=DT, duration=1500.0, x0=model.x0, seed=0
+    )
+    assert result.source == ("MPC",) * 150
+    np.testing.assert_allclose(result.y[-10:], 0.4, atol=1e-3)
+
+
+def test_other_kinds_of_observers_have_no_c(kit, tmp_path):
+    with pytest.raises(hm.InputError, match=r"MovingHorizonEstimator.*HM-EMBEDDED-011"):
+        write_controller(tmp_path / "c", kit.models["prior"], OCP, estimator=kit.observer(kind="mhe"))
+    with pytest.raises(hm.InputError, match=r"did you mean 'mhe'.*HM-RECORDS-011"):
+        kit.observer(kind="mhes")
 
 
 def test_a_problem_whose_outputs_no_input_holds_is_refused(kit):

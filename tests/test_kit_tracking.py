@@ -79,6 +79,10 @@ def test_a_tracking_loop_finds_the_outlet_and_has_no_offset(kit):
     np.testing.assert_allclose(np.mean(heights[-20:]), 0.4, atol=2e-3)
 
 
+def test_the_window_of_a_moving_horizon_observer_has_the_tracked_parameters(kit):
+    assert isinstance(kit.tracking_observer(kind="mhe").inner, hm.MovingHorizonEstimator)
+
+
 def test_c_refuses_an_observer_that_tracks(kit, tmp_path):
     observer = kit.tracking_observer()
     with pytest.raises(hm.InputError, match=r"TrackingFilter.*HM-EMBEDDED-011"):

@@ -23,7 +23,7 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import free_run, stage_step
 
 if TYPE_CHECKING:  # BLAS takes long to import
-    from hybrid_mpc.control.active_set import Active
+    from hybrid_mpc.model.active_set import Active
 
 Array = NDArray[np.float64]
 KEPT = 1e-7

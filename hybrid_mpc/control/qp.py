@@ -8,9 +8,9 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.control.active_set import Active, ActiveSet, RowQP
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import BoundRows, Status
+from hybrid_mpc.model.active_set import Active, ActiveSet, RowQP
 
 Array = NDArray[np.float64]
 Soft = tuple[Array, Array] | None
@@ -40,7 +40,7 @@ class InputQP:
 
     For a problem with move blocks the unknowns are the blocks' inputs; arguments and results are by period. Inputs are
     scaled by :attr:`OCP.input_scale`, soft bounds by :attr:`BoundRows.scale`. Inactive bounds only cost their check
-    (:class:`~hybrid_mpc.control.active_set.ActiveSet`, warm-started from the last plan). Every solution is checked.
+    (:class:`~hybrid_mpc.model.active_set.ActiveSet`, warm-started from the last plan). Every solution is checked.
     """
 
     def __init__(self, ocp: OCP, soft: BoundRows | None = None, dt: float = 1.0) -> None:

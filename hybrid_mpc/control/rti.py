@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dgemv
 
-from hybrid_mpc.control.active_set import Active
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
 from hybrid_mpc.control.qp import InputQP
 from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.active_set import Active
 from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.limits import MOST_ITERATIONS, whole
 from hybrid_mpc.model.model import HybridModel

@@ -8,7 +8,6 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.control.active_set import PRIMAL_TOLERANCE, Active
 from hybrid_mpc.control.curvature import StageCurvature, convex
 from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Controller, Solution, Status, Target
@@ -16,6 +15,7 @@ from hybrid_mpc.control.qp import Answer
 from hybrid_mpc.control.rti import CondensedController, Prepared, adjoint, condense_hessians
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
+from hybrid_mpc.model.active_set import PRIMAL_TOLERANCE, Active
 from hybrid_mpc.model.limits import MOST_ITERATIONS, whole
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.model.stages import Derivatives

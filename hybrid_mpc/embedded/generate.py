@@ -188,7 +188,7 @@ def sources_of(found: Sources) -> tuple[str, ...]:
 def _refused(ocp: OCP, estimator: object, single: bool) -> list[str]:
     """Texts about the parts of a control problem and an observer that cannot be exported as C."""
     found = []
-    if not isinstance(estimator, ExtendedKalmanFilter | SwitchingFilter | None):
+    if type(estimator) not in (ExtendedKalmanFilter, SwitchingFilter, type(None)):
         found.append(
             f"an estimator of this kind ({type(estimator).__name__}); needed: an ExtendedKalmanFilter or a "
             "SwitchingFilter, on a model that holds the delays (with_input_delay)"

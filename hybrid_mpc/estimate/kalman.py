@@ -311,18 +311,18 @@ class ExtendedKalmanFilter:
             return estimate, 0.0
         y_hat, c = self._predicted(estimate, u)
         innovation = np.where(seen, y - y_hat, np.nan)
-        p, step, nis, size = estimate.P, np.zeros(c.shape[1]), 0.0, 0.0
-        for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
-            pc = p @ c[i]
-            s = float(c[i] @ pc) + self._noise_y[i]
-            gain, error = pc / s, innovation[i] - c[i] @ step
-            i_kc = np.eye(step.size) - np.outer(gain, c[i])
-            p = i_kc @ p @ i_kc.T + self._noise_y[i] * np.outer(gain, gain)
-            step, nis, size = step + gain * error, nis + float(error / s * error), size + float(np.log(s))
+        step, p, nis, size = absorbed(estimate.P, c, innovation, self._noise_y, seen)
         n_z = n_x + n_h
         x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]
-        after = Estimate(estimate.t, x, h, d, 0.5 * (p + p.T), innovation, nis, w=estimate.w)
+        after = Estimate(estimate.t, x, h, d, p, innovation, nis, w=estimate.w)
         return after, -0.5 * (nis + size)
+
+    def same_on(self, model: HybridModel, **sigmas: Array) -> ExtendedKalmanFilter:
+        """A filter of the same kind on another model with the same states and outputs.
+
+        ``sigmas`` are the arguments of the constructor.
+        """
+        return type(self)(model, **sigmas)
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
         """Covariance ``(n_y, n_y)`` that a predicted estimate gives its innovation: ``C P C' + R``."""
@@ -396,6 +396,28 @@ def _variance(sigma: ArrayLike, size: int, name: str) -> Array:
     if np.any(values < 0):
         raise InputError(f"{name} must not be negative, got {values} [HM-ESTIMATE-008]")
     return values**2
+
+
+def absorbed(
+    p: Array, c: Array, innovation: Array, noise: Array, seen: NDArray[np.bool_]
+) -> tuple[Array, Array, float, float]:
+    """Correction of a mean with the covariance ``p`` ``(n, n)`` by those outputs that are ``seen`` ``(n_y,)``.
+
+    ``c`` ``(n_y, n)`` are the outputs' slopes, ``noise`` ``(n_y,)`` the sensors' variances.
+
+    Returns:
+        Step of the mean ``(n,)``, covariance after it (Joseph form), normalised innovation squared, and logarithm of
+        the determinant of the innovations' covariance.
+    """
+    step, nis, size = np.zeros(c.shape[1]), 0.0, 0.0
+    for i in np.flatnonzero(seen):  # one by one is exact, since the noises are independent
+        pc = p @ c[i]
+        s = float(c[i] @ pc) + noise[i]
+        gain, error = pc / s, innovation[i] - c[i] @ step
+        i_kc = np.eye(step.size) - np.outer(gain, c[i])
+        p = i_kc @ p @ i_kc.T + noise[i] * np.outer(gain, gain)
+        step, nis, size = step + gain * error, nis + float(error / s * error), size + float(np.log(s))
+    return step, 0.5 * (p + p.T), nis, size
 
 
 class TrueState:

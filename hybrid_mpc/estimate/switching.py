@@ -89,9 +89,11 @@ class SwitchingFilter:
 
     def __init__(self, filters: Sequence[ExtendedKalmanFilter], transition: ArrayLike) -> None:
         m, p = len(filters), np.array(transition, dtype=float)
-        if not m or any(f.model is not filters[0].model for f in filters):
+        if not m or any(
+            f.model is not filters[0].model or type(f) is not ExtendedKalmanFilter for f in filters
+        ):
             raise InputError(
-                "switching filter: at least one filter is needed, all on the same model [HM-ESTIMATE-018]"
+                "switching filter: at least one ExtendedKalmanFilter is needed, all on the same model [HM-ESTIMATE-018]"
             )
         if p.shape != (m, m) or np.any(p < 0) or not np.allclose(p.sum(axis=1), 1.0, atol=1e-9):
             raise InputError(

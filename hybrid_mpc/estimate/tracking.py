@@ -328,7 +328,7 @@ class TrackingFilter:
         noise, first = np.sqrt(filter.noise[0]), np.sqrt(filter.first)
         std = np.array([one.std for one in self.tracked])
         rest = np.array([1.0 - math.exp(-2.0 * model.dt / one.time) for one in self.tracked])
-        return ExtendedKalmanFilter(
+        return filter.same_on(
             model, sigma_y=np.sqrt(filter.noise[1]), sigma_x=noise[:n_x], sigma_x0=first[:n_x],
             sigma_d=noise[n_z:], sigma_d0=first[n_z:],
             sigma_h=np.append(noise[n_x:n_z], std * np.sqrt(rest)), sigma_h0=np.append(first[n_x:n_z], std),

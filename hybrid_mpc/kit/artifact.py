@@ -503,23 +503,28 @@ class Kit:
             )
         return own.limits[kind]
 
-    def observer(self, model: str = "", *, task: str = "", load: bool = True) -> Filter:
+    def observer(
+        self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching"
+    ) -> Filter:
         """The estimator of a model's state, hidden state and, with ``load``, unknown disturbances.
 
         Args:
             model: Name of the model. Default: the recommended model.
             task: Task whose control problem determines the size of a load. Default: the common control problem.
             load: Whether it estimates a load; without this, a constant load causes an offset. Default: True.
+            kind: ``"switching"``, ``"ekf"``, ``"ukf"`` or ``"mhe"`` (docs/observers.md). Default: switching.
 
         Raises:
-            InputError: If model or task are unknown, or control problem or noise are missing.
+            InputError: If model, task or kind are unknown, or control problem or noise are missing.
         """
         check_flag(load, "load")
         model = _named(model, "model") or self.recommended
         found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
-        return make_estimator(found, self, noise, self.problem(task), observer=load)
+        return make_estimator(found, self, noise, self.problem(task), observer=load, kind=kind)
 
-    def tracking_observer(self, model: str = "", *, task: str = "", load: bool = True) -> TrackingFilter:
+    def tracking_observer(
+        self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching"
+    ) -> TrackingFilter:
         """:meth:`observer` that also tracks the parameters that differ between recordings (docs/tracking.md).
 
         Its estimates belong to the model whose last measured disturbances are the tracked parameters; a loop needs the
@@ -529,6 +534,7 @@ class Kit:
             model: Name of the model. Default: the recommended model.
             task: As for :meth:`observer`.
             load: As for :meth:`observer`.
+            kind: As for :meth:`observer`.
 
         Raises:
             InputError: If the kit names no tracked parameters, or as :meth:`observer`.
@@ -536,7 +542,7 @@ class Kit:
         Example:
             ``loop = hm.Loop(kit.tracking_observer(), kit.controller(tracking=True), reference=[0.5])``
         """
-        return TrackingFilter(self.observer(model, task=task, load=load), self._tracked())
+        return TrackingFilter(self.observer(model, task=task, load=load, kind=kind), self._tracked())
 
     def with_tracked(self, tracked: Sequence[TrackedParameter]) -> Kit:
         """A kit whose :meth:`tracking_observer` tracks these parameters."""

@@ -106,6 +106,28 @@ SOLVERS: Mapping[str, Callable[..., Controller]] = {
 quadratic programming to convergence; ``ipopt``, the nonlinear program solved by IPOPT."""
 
 
+def _unscented(model: HybridModel, **sigmas: Any) -> ExtendedKalmanFilter:
+    from hybrid_mpc.estimate.unscented import UnscentedKalmanFilter
+
+    return UnscentedKalmanFilter(model, **sigmas)
+
+
+def _moving_horizon(model: HybridModel, **sigmas: Any) -> ExtendedKalmanFilter:
+    from hybrid_mpc.estimate.moving_horizon import MovingHorizonEstimator
+
+    return MovingHorizonEstimator(model, **sigmas)
+
+
+OBSERVERS: Mapping[str, Callable[..., ExtendedKalmanFilter]] = {
+    "switching": ExtendedKalmanFilter,
+    "ekf": ExtendedKalmanFilter,
+    "ukf": _unscented,
+    "mhe": _moving_horizon,
+}
+"""Filters by kind of observer: ``switching`` between three extended Kalman filters, one ``ekf``, the unscented Kalman
+filter ``ukf``, and the moving horizon estimator ``mhe``."""
+
+
 class LoopAssumptions(Protocol):
     """Assumptions of estimators and guards about a machine, given by a scenario or a kit."""
 
@@ -178,12 +200,13 @@ def make_estimator(
     control: OCP | None = None,
     *,
     observer: bool = True,
+    kind: str = "switching",
 ) -> Filter:
     """Build the estimator of a model.
 
-    With ``observer`` it switches between three filters (:data:`MODES`). A single filter is either fast enough for a
-    push, but then passes the encoder's quantization on to the input, or quiet, but then takes a push for noise. The
-    unknown loads are those of the model's ``disturbance_model``.
+    With ``observer``, the kind ``switching`` switches between three filters (:data:`MODES`). A single filter is either
+    fast enough for a push, but then passes the encoder's quantization on to the input, or quiet, but then takes a push
+    for noise. The unknown loads are those of the model's ``disturbance_model``.
 
     Args:
         model: The model.
@@ -191,15 +214,19 @@ def make_estimator(
         sigma_x: Process noise ``(n_x,)`` per period, see :func:`~hybrid_mpc.estimate.tuning.process_noise`.
         control: The control problem, whose ``input_range`` determines the size of a load. Default: the scenario's.
         observer: Whether it estimates the unmeasured disturbances. Default: True.
+        kind: Kind of observer (:data:`OBSERVERS`, docs/observers.md). Kinds other than ``switching`` have the noise of
+            its quiet filter. Default: switching; without ``observer`` that is the extended Kalman filter.
 
     Raises:
-        InputError: If the size of ``sensor_sigma`` or ``first_sigma`` is wrong, there is no control problem, the
-            disturbances are not observable, or the process noise hides them, so that a load is never estimated.
+        InputError: If the kind is unknown, the size of ``sensor_sigma`` or ``first_sigma`` is wrong, there is no
+            control problem, the disturbances are not observable, or the process noise hides them, so that a load is
+            never estimated.
 
     Example:
         ``make_estimator(model, scenario, process_noise(model, train))``
     """
     control = scenario.control if control is None else control
+    make = OBSERVERS[known(kind, OBSERVERS, "kind of observer")]
     if control is None:
         raise InputError(
             f"scenario {scenario.name}: no control problem, so no input range; give control=OCP(...) [HM-KIT-011]"
@@ -212,16 +239,22 @@ def make_estimator(
             "[HM-KIT-012]"
         )
 
-    def filter_of(scale: float, step: Array | None) -> ExtendedKalmanFilter:
-        return ExtendedKalmanFilter(
+    def filter_of(
+        scale: float, step: Array | None, make: Callable[..., ExtendedKalmanFilter] = ExtendedKalmanFilter
+    ) -> ExtendedKalmanFilter:
+        return make(
             model, sigma_y=np.array(scenario.sensor_sigma), sigma_x=scale * sigma_x, sigma_x0=first,
             sigma_d=None if step is None else step * span, sigma_d0=None if step is None else FIRST_LOAD * span,
         )  # fmt: skip
 
     if not observer:
-        return filter_of(1.0, None)
+        return filter_of(1.0, None, make)
     periods = round(FOUND_HORIZONS * control.horizon)
-    quiet, slip = (quiet_shares(partial(filter_of, scale), periods, model.n_d) for scale in (1.0, SLIP))
+    quiet = quiet_shares(partial(filter_of, 1.0), periods, model.n_d)
+    if kind != "switching":
+        _check_found((filter_of(1.0, quiet),), SEARCHED * control.horizon, Sizes(model, control).states)
+        return filter_of(1.0, quiet, make)
+    slip = quiet_shares(partial(filter_of, SLIP), periods, model.n_d)
     # else the slip filter would explain a lasting load by repeated slips, and never estimate it
     # jump: a load of 5 % of the drive's range is ordinary, a larger one takes a few periods
     modes = (

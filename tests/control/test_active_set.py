@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_mpc.control.active_set import ActiveSet, RowQP
+from hybrid_mpc.model.active_set import ActiveSet, RowQP
 
 
 def random_qp(seed, n=12, m=40):

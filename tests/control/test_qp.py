@@ -5,8 +5,8 @@ import pytest
 
 from hybrid_mpc import OCP, Status
 from hybrid_mpc.control import qp as qp_module
-from hybrid_mpc.control.active_set import ActiveSet, Found
 from hybrid_mpc.control.qp import InputQP
+from hybrid_mpc.model.active_set import ActiveSet, Found
 
 HESSIAN = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 3.0]])
 GRADIENT = np.array([-9.0, 0.5, 1.0])
