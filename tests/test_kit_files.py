@@ -12,22 +12,12 @@ import pytest
 
 import hybrid_mpc as hm
 from hybrid_mpc import InputError, RunSettings, load_scenario
-from hybrid_mpc.files import read_document, sha256, write_document
+from hybrid_mpc.files import sha256
 from hybrid_mpc.kit import parts as files
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.kit.migrate import (
-    OldCalibration,
-    OldChannels,
-    OldDetector,
-    OldEnergy,
-    OldGuard,
-    OldResidualLimits,
-    migrate_kit,
-)
 from hybrid_mpc.kit.parts import (
     MODELS,
     OBSERVER,
-    OLD_FILE,
     OWNERS,
     PROGRAMS,
     WatchFile,
@@ -40,7 +30,6 @@ from hybrid_mpc.kit.parts import (
     TASKS as TASK_LIST,
 )
 from hybrid_mpc.kit.promises import Promise, read_promises
-from hybrid_mpc.records import plain
 from hybrid_mpc.workflow import run as job
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, TASKS, ExportResult, NoiseResult, put_noise
@@ -368,99 +357,3 @@ def test_a_half_written_set_of_tasks_is_missing(whole, tmp_path):
     assert "tasks" in kit.lacks[TASK_LIST]
     with pytest.raises(InputError, match=r"stage tasks.*HM-KIT-007"):
         kit.problem(path.stem)
-
-
-# former formats
-
-DETECTOR = OldDetector(
-    0.02,
-    ((1e-4, 1e-4, 0.0, 1e-4),),
-    (1e-5, 0.0, 0.0, 1e-5),
-    2.0,
-    4.0,
-    5.0,
-    rest_speed=(0.2,),
-    interval=(3, 5, 4, 6),
-)
-CALIBRATION = OldCalibration(0.2, 0.1, 1.0, 1000, 0.1, "by hand", "", 0.2, 0.1, rest_speed=(0.2,))
-RESIDUALS = OldResidualLimits(
-    ("phi", "energy", "free run of phi"), 0.02, ((1.0, 2.0),) * 3, ((0.5, 1.0),) * 3, (1.0,), (3,), 1.0, 1.0
-)
-
-
-def old_kit(folder, **loop):
-    """A kit of version 4: the golden one, with all that its file could hold."""
-    shipped = ROOT / "tests" / "golden" / "golf_robot"
-    folder.mkdir()
-    for name in files.OLD_FILES:
-        shutil.copyfile(shipped / name, folder / name)
-    path = folder / OLD_FILE
-    document = read_document(path)
-    settings = replace(files.loop_settings(GOLF), process_noise={"hybrid_observer": (1e-4, 1e-2)})
-    document |= {"loop": plain(settings), "residuals": plain({"hybrid": RESIDUALS})}
-    document["calibration"] = plain(replace(CALIBRATION, detector=DETECTOR))
-    write_document(path, document)
-    return folder
-
-
-def split_kit(new, folder):
-    """A kit of version 5: the present files but for those in ``watch``, and their former ones."""
-    shutil.copytree(new, folder)
-    for path in (folder / "watch").glob("*.json"):
-        path.unlink()
-    of = read_parts(new).observer("hybrid")
-    held = {
-        "watch/energy.json": OldEnergy(CALIBRATION, of),
-        "watch/residuals.json": OldChannels({"hybrid": RESIDUALS}, {"hybrid": of}),
-        "guard.json": OldGuard(DETECTOR, "", of),
-    }
-    for name, content in held.items():
-        write_document(folder / name, {"schema_version": 5, **plain(content)})
-    for path in [*folder.glob("*.json"), *(folder / "tasks").glob("*.json")]:
-        if path.name != "promises.json":
-            write_document(path, read_document(path) | {"schema_version": 5})
-    return folder
-
-
-def test_a_kit_of_a_former_format_is_migrated_or_refused_with_the_line(tmp_path, call):
-    old = old_kit(tmp_path / "old")
-    for version, place in ((4, old), (5, tmp_path / "split")):
-        if version == 5:
-            split_kit(tmp_path / "new4", place)
-        with pytest.raises(InputError, match=f"hybrid-mpc export kit {place} --out NEW"):
-            hm.load(place)
-        new = tmp_path / f"new{version}"
-        code, _, error = call("export", "kit", place, "--out", new)
-        assert code == 0, error
-        kit = hm.load(new)
-        assert kit.lacks == {}
-        assert kit.loop == replace(files.loop_settings(GOLF), process_noise={"hybrid_observer": (1e-4, 1e-2)})
-        assert kit.programs_sha256 == sha256(old / "programs.json")
-        assert kit.rest_speed == (0.2,)
-        force, power = kit.monitor().limits.channels
-        assert (force.channel, force.threshold, force.release) == ("force of phi", 4.0, 2.0)
-        assert (force.scale, force.drift, force.interval) == (DETECTOR.force[0], 2.0, (3, 5))
-        assert (power.channel, power.length, power.threshold) == ("power of the free run", 1, 5.0)
-        assert kit.monitor().limits.travel == pytest.approx((3 * 12**0.5 * GOLF.sensor_sigma[0],))
-        own = kit.monitor(kind="residuals").limits
-        assert [(c.channel, c.unit, c.length, c.threshold) for c in own.channels][:2] == [
-            ("phi", "rad", 15, 1.0), ("phi", "rad", 150, 2.0),
-        ]  # fmt: skip
-        assert (own.travel, own.repeats) == ((1.0,), (3,))
-    for place in (tmp_path / "new5", tmp_path / "none"):
-        with pytest.raises(InputError, match="HM-KIT-027"):
-            migrate_kit(place, tmp_path / "again")
-    document = read_document(old / OLD_FILE)
-    write_document(old / OLD_FILE, document | {"schema_version": 3})
-    with pytest.raises(InputError, match="HM-KIT-028"):
-        migrate_kit(old, tmp_path / "again")
-    assert not (tmp_path / "again").exists()
-
-
-def test_a_run_of_an_older_version_leaves_nothing_of_its_kit_behind(tmp_path, sources):
-    """Resumed by this version: the stage export writes the present files, and the old ones go."""
-    folder = old_kit(tmp_path / "model")
-    shutil.copytree(sources[0] / MODELS, folder / MODELS)
-    write_description(folder, read_description(sources[0]))
-    assert sorted(path.name for path in folder.iterdir()) == ["kit.json", MODELS]
-    assert set(hm.load(folder).models) == {"hybrid", "prior"}

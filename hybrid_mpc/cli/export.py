@@ -1,9 +1,8 @@
-"""``hybrid-mpc export``: a trained controller as C, or a kit of an older format in the present one."""
+"""``hybrid-mpc export``: a trained controller as C."""
 
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -17,24 +16,7 @@ EXAMPLES = (
     "  hybrid-mpc export c runs/golf --guard --check --out controller"
 )
 
-app = typer.Typer(
-    help="Write a trained controller as C, or an older kit in the present format.",
-    no_args_is_help=True, rich_markup_mode=None,
-)  # fmt: skip
-
-
-@app.command("kit", epilog="Example:\n\n  hybrid-mpc export kit runs/old --out kit")
-def kit(
-    old: Annotated[
-        Path, typer.Argument(help="Kit of an older format (model.json), or the folder of its run.")
-    ],
-    out: EmptyFolder,
-) -> None:
-    """Write a kit of an older format in the present one, into a new folder; nothing is recomputed."""
-    from hybrid_mpc.kit.migrate import migrate_kit
-
-    folder = migrate_kit(old, out)
-    print(f"kit in {folder.resolve()}. Load it with hm.load, or use its folder instead of the old one.")
+app = typer.Typer(help="Write a trained controller as C.", no_args_is_help=True, rich_markup_mode=None)
 
 
 @app.command("c", epilog=EXAMPLES)

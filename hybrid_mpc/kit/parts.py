@@ -61,12 +61,6 @@ OWNERS: Mapping[str, str] = {
     WATCH: "watch", "promises.json": "promises",
 }  # fmt: skip
 """The only stage of a run that writes a file, by file."""
-OLD_FILE, OLD_SCHEMA = "model.json", 4
-"""Description of a kit in format version 4, a single file; see :mod:`hybrid_mpc.kit.migrate`."""
-SPLIT_SCHEMA = 5
-"""Previous format version with several files; it can be migrated, too."""
-OLD_FILES = (OLD_FILE, "programs.json", "weights.safetensors")
-SPLIT_FILES = ("watch/energy.json", "watch/residuals.json", "guard.json")
 MOST_MODELS = 16
 """Largest number of models in an artifact: prior, hybrid, and a few for comparison."""
 HYBRID = "hybrid"
@@ -383,10 +377,8 @@ class Parts:
 
 
 def write_description(folder: Path, description: Description) -> None:
-    """Write ``kit.json``, and delete files of older formats in the folder."""
+    """Write ``kit.json``."""
     _write(folder, KIT, description)
-    for name in (*OLD_FILES, *SPLIT_FILES):
-        (folder / name).unlink(missing_ok=True)
 
 
 def write_observer(folder: Path, observer: ObserverSettings) -> None:
@@ -584,19 +576,14 @@ def _read(folder: Path, file: str, kind: type[R]) -> R | None:
     if not is_file(path):
         return None
     if (version := read_object(path).get("schema_version")) != SCHEMA_VERSION:
-        remedy = _anew(folder) if version == SPLIT_SCHEMA else "Run the scenario again"
         raise InputError(
             f"{path}: format version {version!r} (field schema_version), but this version of hybrid-mpc reads "
-            f"{SCHEMA_VERSION}. {remedy} [HM-KIT-035]"
+            f"{SCHEMA_VERSION}. Run the scenario again [HM-KIT-035]"
         )
     again = "" if file == KIT else f"; or delete it, and {AGAIN}"
     document = read_document(path, f"copy the folder from its run again{again}")
     del document["schema_version"]
     return record(kind, document, str(path))
-
-
-def _anew(folder: Path) -> str:
-    return f"Convert it with: hybrid-mpc export kit {folder} --out NEW"
 
 
 def artifact_files(folder: Path) -> tuple[str, ...]:
@@ -625,11 +612,6 @@ def artifact_folder(folder: Path) -> Path:
     for place in (folder, folder / "model"):
         if is_file(place / KIT):
             return place
-    for place in (folder, folder / "model"):
-        if is_file(place / OLD_FILE):
-            raise InputError(
-                f"{place / OLD_FILE}: this kit has an older format with a single file. {_anew(place)} [HM-KIT-036]"
-            )
     try:
         state = f"no {KIT} in it" if folder.is_dir() else "is a file" if folder.exists() else "does not exist"
     except OSError as error:

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import casadi as ca
 import embedded_parts as parts
@@ -26,8 +25,8 @@ from hybrid_mpc.embedded.scalar import c_function, comment
 from hybrid_mpc.embedded.watch import Watched
 from hybrid_mpc.errors import StorageError
 from hybrid_mpc.files import write_document
+from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.kit.assembly import make_controller
-from hybrid_mpc.kit.migrate import migrate_kit
 from hybrid_mpc.kit.parts import KIT, TASKS, loop_settings, read_parts, save_loop
 
 STRICT = [
@@ -338,7 +337,10 @@ PLACES = (
 
 def test_no_artifact_carries_code_in_a_name(tmp_path):
     """Whatever it is the name of, and whoever wrote the folder: its hash is right."""
-    kit = migrate_kit(Path(__file__).parents[1] / "golden" / "golf_robot", tmp_path / "kit")
+    kit, scenario = tmp_path / "kit", hm.load_scenario("golf_robot")
+    prior = scenario.prior()
+    info = model_info(prior, scenario.data.dt)
+    hm.save_artifact(kit, {"prior": prior_programs(prior, info.dt)}, info, loop=loop_settings(scenario))
     for file, place, key in PLACES:
         path = kit / file
         whole = path.read_text()

@@ -40,8 +40,7 @@ from hybrid_mpc import (
     simulate,
     with_parameter_states,
 )
-from hybrid_mpc.kit.artifact import build_model
-from hybrid_mpc.kit.migrate import migrate_kit
+from hybrid_mpc.kit.artifact import build_model, save_artifact
 from hybrid_mpc.records import record
 
 HERE = Path(__file__).parent
@@ -206,11 +205,14 @@ def machine(name):
     return Machine(name, HERE / name)
 
 
-def artifact_of(folder, out):
-    """Models by name and limits as the library's own reader finds them once a kit of the former format is migrated
-    to the folder ``out``.
-    """
-    found = load(migrate_kit(folder, out))
+def artifact_of(m, out):
+    """Models by name and limits, as the library's own reader finds them in an artifact ``out`` of the programs."""
+    programs = {name: {} for name in m.data["models"]}
+    for key, program in nn_export.load_programs(m.folder).items():
+        model, _, function = key.partition("/")
+        programs[model][function] = program
+    save_artifact(out, programs, m.info, limits={"hybrid": [m.limits]})
+    found = load(out)
     return found.models, found.limits("hybrid")
 
 
