@@ -714,7 +714,7 @@ def horizon_of(draft: Draft) -> tuple[int, str]:
     asked = max(round(2 * pace / draft.period), 1)
     periods = min(max(asked, HORIZONS[0]), HORIZONS[1])
     why = (
-        f"{periods} periods of {draft.period:.3g} s; the slowest time constant that matters is {pace:.3g} s, that of "
+        f"{periods} periods of {draft.period:.3g} s; the slowest significant time constant is {pace:.3g} s, that of "
         f"{printable(draft.outputs[i].full)}"
     )
     if asked > periods:
@@ -768,7 +768,9 @@ def _first_control(draft: Draft, n_x: int) -> list[str]:
         f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",
         f"    # sensor_sigma={sigma},  # standard deviation of each sensor's error{origin}",
         *(
-            [f"    # {MARK}: sensor_sigma is a guess for {', '.join(guessed)}: look it up, or record at rest"]
+            [
+                f"    # {MARK}: sensor_sigma of {', '.join(guessed)} is assumed: see the data sheet, or record at rest"
+            ]
             if guessed
             else []
         ),

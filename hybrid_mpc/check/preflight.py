@@ -453,7 +453,7 @@ def _check_methods(plant: Plant, prior: Prior, dt: float) -> None:
             )
         if not np.all(np.isfinite(found)):
             raise InputError(
-                f"{name}: must return finite numbers, got {found} one period after rest [HM-CHECK-026]"
+                f"{name}: must return finite numbers, got {found} one period after the operating point [HM-CHECK-026]"
             )
 
 

@@ -49,7 +49,7 @@ def check(
         ),
     ] = False,
 ) -> None:
-    """Report on a machine and its recordings, and list all errors; nothing is computed.
+    """Report on a machine and its recordings, and list all errors; nothing is computed without --fit.
 
     'run', 'tune' and 'benchmark' begin with the same check. With --fit the prior is fitted as in a run, and doubts
     about its structure are listed. No network is trained, no file is written. Exit code 2 if there are errors.

@@ -49,7 +49,9 @@ def control(
     ] = None,
     guard: Annotated[
         bool,
-        typer.Option("--guard", help="Use the model's fault monitor; no input while the sensor is frozen."),
+        typer.Option(
+            "--guard", help="Use the model's fault monitor; the safe input acts while a sensor is frozen."
+        ),
     ] = False,
     adapt: Annotated[
         bool,

@@ -34,7 +34,7 @@ def c(
         bool, typer.Option("--monitor/--no-monitor", help="Include the fault monitor.")
     ] = True,
     guard: Annotated[
-        bool, typer.Option("--guard", help="React to alarms: no input while the sensor is frozen.")
+        bool, typer.Option("--guard", help="React to alarms: the safe input acts while a sensor is frozen.")
     ] = False,
     adapt: Annotated[
         bool,

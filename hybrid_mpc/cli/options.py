@@ -11,7 +11,9 @@ ScenarioName: TypeAlias = Annotated[
     str, typer.Argument(help="A registered name (see: hybrid-mpc scenarios) or a .py file.")
 ]
 Recordings: TypeAlias = Annotated[list[Path] | None, typer.Option(help="A recording; may be repeated.")]
-TimeColumn: TypeAlias = Annotated[str, typer.Option(help="Column of the time [s]. Default: the scenario's.")]
+TimeColumn: TypeAlias = Annotated[
+    str, typer.Option(help="Column of the time [s]. Default: that of the scenario; new finds it.")
+]
 InputColumns: TypeAlias = Annotated[
     list[str] | None, typer.Option(help="Column of an input, in the prior's order; may be repeated.")
 ]

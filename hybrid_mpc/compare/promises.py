@@ -499,7 +499,7 @@ def _explain_offset(point: SetPoint, result: ClosedLoopResult, errors: Array) ->
         return "the weight r pulls the input to that of the operating point; set r = 0 and weight changes by r_delta"
     true = np.array([model.output(x, model.u0, point.w, model.p).full().ravel() for x in result.x[late]])
     if all(float(np.std(true[:, one])) < STANDS * point.sigma[one] for one in point.held):
-        return "the machine stands still off its set-point, as with dry friction"
+        return "the machine is at rest beside its set-point, as with dry friction"
     return "no disturbance of the model explains the error"
 
 

@@ -387,7 +387,7 @@ def short_runs(spec: DataSpec, test: Sequence[Trajectory]) -> tuple[str, ...]:
     if not spec.free_run or not test or longest >= 0.95 * spec.free_run:
         return ()
     return (
-        f"DataSpec.free_run asks for free runs of {spec.free_run:g} s, but the longest piece of test data leaves "
+        f"DataSpec.free_run is {spec.free_run:g} s, but the longest piece of test data leaves "
         f"{max(longest, 0.0):.4g} s after its warm-up of {spec.warm_up:g} s: models are evaluated on shorter runs. "
         "Give longer recordings, or name windows in the DataSpec",
     )

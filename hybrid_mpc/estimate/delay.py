@@ -85,7 +85,8 @@ class DelayCompensation:
         """Estimate one period later, from the arrived measurement and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
             raise InputError(
-                "DelayCompensation: the estimate must be its own. Begin with start(). [HM-ESTIMATE-005]"
+                "DelayCompensation: the estimate is of another filter. Begin with start() of this one. "
+                "[HM-ESTIMATE-005]"
             )
         base, y = estimate.filtered, sampled(y, (None,), "y")
         inputs = (*estimate.inputs, sampled(u_prev, (None,), "u_prev"))

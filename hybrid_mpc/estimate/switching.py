@@ -255,7 +255,7 @@ class SwitchingFilter:
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
         if not isinstance(estimate, SwitchingEstimate) or len(estimate.z) != len(self.filters):
             raise InputError(
-                "SwitchingFilter: the estimate must be its own. Begin with start(). [HM-ESTIMATE-020]"
+                "SwitchingFilter: the estimate is of another filter. Begin with start() of this one. [HM-ESTIMATE-020]"
             )
         return estimate
 

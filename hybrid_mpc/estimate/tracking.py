@@ -375,7 +375,7 @@ class TrackingFilter:
     def _own(self, estimate: Estimate) -> TrackedEstimate:
         if not isinstance(estimate, TrackedEstimate):
             raise InputError(
-                "TrackingFilter: the estimate must be its own. Begin with start(). [HM-ESTIMATE-027]"
+                "TrackingFilter: the estimate is of another filter. Begin with start() of this one. [HM-ESTIMATE-027]"
             )
         return estimate
 

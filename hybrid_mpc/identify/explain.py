@@ -983,9 +983,9 @@ def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points:
     problems = []
     for term in own:
         if names.count(term.name) > 1:
-            problems.append(f"term {term.name!r} is there twice; rename one. [HM-IDENTIFY-013]")
+            problems.append(f"term {term.name!r} has the name of another term; rename it. [HM-IDENTIFY-013]")
         problems += [
-            f"term {term.name!r}: parameter {name} is there twice; rename one. [HM-IDENTIFY-014]"
+            f"term {term.name!r}: parameter {name} has the name of another parameter; rename it. [HM-IDENTIFY-014]"
             for name in term.names
             if parameters.count(name) > 1
         ]

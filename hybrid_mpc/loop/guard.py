@@ -167,7 +167,7 @@ class GuardedController:
         self.safe, self.guard = safe, guard
         if guard is not None and Mode.REST in (guard.on_model, guard.on_sensor) and safe.safe_input is None:
             raise InputError(
-                "guard: mode REST needs a safe input, with which the machine may be left alone. Give "
+                "guard: mode REST needs a safe input, which may act without supervision. Give "
                 "Scenario(safe_input=...) or SafeController(safe_input=...) [HM-LOOP-015]"
             )
         self._backup = safe if guard is None or guard.backup is None else guard.backup

@@ -163,7 +163,7 @@ class Runner:
         declared = loop.safe_input if safe_input is None else safe_input
         if declared is None:
             raise InputError(
-                "Runner: safe_input is missing: the input with which the machine may be left alone. Give "
+                "Runner: safe_input is missing: the input that may act without supervision. Give "
                 "safe_input=[...], or Scenario(safe_input=...). There is no default, since zero is not safe for every "
                 "machine [HM-LOOP-036]"
             )

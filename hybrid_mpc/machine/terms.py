@@ -464,7 +464,7 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
         twice = sorted({name for name in every if every.count(name) > 1})
         if twice:
             problems.append(
-                f"{base.__name__} with terms: {what} {', '.join(twice)} is there twice; rename one. [HM-MACHINE-038]"
+                f"{base.__name__} with terms: {what} {', '.join(twice)} occur twice; rename one. [HM-MACHINE-038]"
             )
     refuse(problems)
 
@@ -592,7 +592,7 @@ def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") 
     Args:
         of: Speed.
         level: F [N or N m], of a rate [unit/s].
-        width: Speed over which it turns round.
+        width: Speed over which the friction changes its sign.
         place: ``"rate"`` for a prior that is not mechanical.
     """
     return _added(
@@ -613,8 +613,8 @@ def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force"
 
     Args:
         of: Speed.
-        more: A [N or N m], half of what it is larger.
-        width: Speed over which friction turns round.
+        more: A [N or N m], half of the difference between both directions.
+        width: Speed over which the friction changes its sign.
         place: ``"rate"`` for a prior that is not mechanical.
     """
     return _added(
@@ -715,7 +715,7 @@ def offset(of: str, value: Parameter, *, place: Place = "force") -> Term:
 
 
 def gravity_error(of: str, sine: Parameter, cosine: Parameter) -> Term:
-    """A weight that the prior has not, or at another angle: the potential ``-a cos q + b sin q``."""
+    """A weight that is missing in the prior, or acts at another angle: the potential ``-a cos q + b sin q``."""
     return _added(
         "gravity_error", "gravity error", "potential", of, (sine, cosine),
         lambda at, p: -p[0] * ca.cos(at.position) + p[1] * ca.sin(at.position),
@@ -743,7 +743,7 @@ def spring(of: str, stiffness: Parameter, *, centre: float) -> Term:
 
 
 def elastic_end(of: str, stiffness: Parameter, *, edge: float, upper: bool) -> Term:
-    """An end that gives way: the potential ``k max(q - edge, 0)^2 / 2``, of a lower end ``edge - q``."""
+    """An elastic stop: the potential ``k max(q - edge, 0)^2 / 2``, of a lower end ``edge - q``."""
     side = 1.0 if upper else -1.0
     return _added(
         "elastic_end", f"{'upper' if upper else 'lower'} elastic end", "potential", of, (stiffness,),
@@ -840,7 +840,7 @@ def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:
 
 
 def overflow(of: str, k: Parameter, edge: Parameter, *, width: float) -> Term:
-    """What runs over an edge: ``-k max(x - edge, 0)``, smooth over ``width``."""
+    """Overflow above an edge: ``-k max(x - edge, 0)``, smooth over ``width``."""
     return _added(
         "overflow", "overflow", "rate", of, (k, edge),
         lambda at, p: -0.5 * p[0] * (at.own - p[1] + ca.sqrt((at.own - p[1]) ** 2 + width**2)),
@@ -849,7 +849,7 @@ def overflow(of: str, k: Parameter, edge: Parameter, *, width: float) -> Term:
 
 
 def coupling(of: str, k: Parameter, *, source: str, centre: float = 0.0) -> Term:
-    """What another signal does to a state: ``k (source - centre)``; an input, state or measured disturbance."""
+    """Effect of another signal on a state: ``k (source - centre)``; an input, state or measured disturbance."""
     return _added(
         "coupling", f"coupling from {source}", "rate", of, (k,), lambda at, p: p[0] * (_signal(at, source) - centre),
         f"{k.name} {source}", source=source, centre=centre,
@@ -857,7 +857,7 @@ def coupling(of: str, k: Parameter, *, source: str, centre: float = 0.0) -> Term
 
 
 def product(of: str, k: Parameter, *, one: str, two: str, centres: tuple[float, float] = (0.0, 0.0)) -> Term:
-    """What two signals do together: ``k (one - c1) (two - c2)``."""
+    """Effect of a product of two signals: ``k (one - c1) (two - c2)``."""
     return _added(
         "product", f"product of {one} and {two}", "rate", of, (k,),
         lambda at, p: p[0] * (_signal(at, one) - centres[0]) * (_signal(at, two) - centres[1]), f"{k.name} {one} {two}",
@@ -917,7 +917,7 @@ def input_curve(of: str, c: Parameter, *, centre: float, span: float) -> Term:
 
 
 def saturation(of: str, k: Parameter) -> Term:
-    """An input that does less the larger it is: ``u / sqrt(1 + k u^2)``; it never exceeds ``1 / sqrt(k)``."""
+    """An input whose effect levels off: ``u / sqrt(1 + k u^2)``; it never exceeds ``1 / sqrt(k)``."""
     return _added(
         "saturation", "saturation", "input", of, (k,),
         lambda at, p: at.own / ca.sqrt(1.0 + p[0] * at.own * at.own), f"{of} / sqrt(1 + {k.name} {of}^2)",

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from hybrid_mpc.identify.explain import DOUBT, GAIN, POOR, WORTH
+from hybrid_mpc.identify.explain import ADDED, DOUBT, GAIN, POOR
 from hybrid_mpc.identify.explanation import ExplainStep, Explanation, Trial, bound
 from hybrid_mpc.plots import explain as plots
 from hybrid_mpc.plots.style import save
@@ -195,12 +195,13 @@ def _judged(explanation: Explanation) -> Sequence[str]:
         "together.",
         f"The search chose from {explanation.candidates} candidates. Each step scores all candidates by one "
         "Gauss-Newton step. The best candidates are fitted in every fold, with all parameters and initial states.",
-        f"A term is added if its ratio to the previous step is below {WORTH:g} and the upper end of its interval is "
+        f"A term is added if its ratio to the previous step is below {ADDED:g} and the upper end of its interval is "
         f"below 1. The ratio is the {explanation.averaged}. The true ratio lies beyond one end of the interval with a "
         f"probability of {DOUBT:.0%}, for all fitted candidates of the step together. In the upper end, a reduction by "
         f"more than {1 - GAIN:.0%} counts as {1 - GAIN:.0%}.",
         "A term is not added if its parameters are not identifiable, if one ends at its bound, or if the error with "
-        f"the term stays above {POOR:g} and its ratio above {GAIN:g}.",
+        f"the term stays above {POOR:g} and its ratio above {GAIN:g}. With a single recording, the ratio must be below "
+        f"{GAIN:g}.",
         "Errors are root mean squares over all held-out samples, divided by the outputs' spreads.",
     )
 

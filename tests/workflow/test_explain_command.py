@@ -13,7 +13,7 @@ from hybrid_mpc import InputError, RunSettings, extended, load_scenario, terms, 
 from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.data.scales import time_unit
-from hybrid_mpc.identify.explain import WORTH
+from hybrid_mpc.identify.explain import ADDED
 from hybrid_mpc.plots.explain import error_steps
 from hybrid_mpc.workflow import explain_page, explain_search
 from hybrid_mpc.workflow.context import Context
@@ -80,7 +80,7 @@ def test_ratios_are_one_statistic_with_one_name(explained, machine):
     assert words in (out / found.file).read_text()
     figure = error_steps(*explain_page.bars_of(told), "error [-]")
     assert not any("%" in text.get_text() for text in figure.axes[0].texts)
-    rule = f"below {WORTH:g} and the upper end of its interval is below 1"
+    rule = f"below {ADDED:g} and the upper end of its interval is below 1"
     assert rule in page
     assert rule in (Path(__file__).parents[2] / "docs/explain.md").read_text()
 

@@ -172,7 +172,7 @@ def _floor(results: Results, declared: Sequence[float]) -> Iterator[Hint]:
                 "plain", f"{said}noise as estimated by the fit, but {error / own:.1f} times the declared noise "
                 f"({own:.2g}).",
                 "Look at the sensor at rest: either sensor_sigma is too small, or the prior lacks an effect that the "
-                "fit takes for noise.",
+                "fit counts as noise.",
             )  # fmt: skip
 
 

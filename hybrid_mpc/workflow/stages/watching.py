@@ -19,7 +19,7 @@ HEADS = (
     "diagnosis",
 )
 CAPTION = (
-    "Channels of the monitor. False alarms begin where nothing disturbs the machine; their interval is that of a "
+    "Channels of the monitor. A false alarm begins while no fault or disturbance acts; their interval is that of a "
     "Poisson count. Each simulated fault stands beside the channel that alarms first."
 )
 
