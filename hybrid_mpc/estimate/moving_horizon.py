@@ -415,18 +415,15 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
 
     def _back(self, f: Array, rows: Array, time: NDArray[np.int64], first_root: Array) -> Array:
         """Slopes ``(R, n + m n_noisy)`` by ``xi`` of rows ``(R, n)`` of ``z`` at times ``(R,)`` in ascending order."""
-        m, n, n_noisy = len(f), rows.shape[1], self._noisy.size
-        by_z = np.array(rows)
-        found = np.zeros((len(rows), n + m * n_noisy))
+        m, count = len(f), len(rows)
+        by_z = np.zeros((m + 1, *rows.shape))
+        by_z[time, np.arange(count)] = rows
         from_time = np.searchsorted(time, np.arange(m + 1)).tolist()
         for k in range(m, 0, -1):
-            later = by_z[from_time[k] :]
-            found[from_time[k] :, n + (k - 1) * n_noisy : n + k * n_noisy] = (
-                later[:, self._noisy] * self._sigma
-            )
-            by_z[from_time[k] :] = later @ f[k - 1]
-        found[:, :n] = by_z @ first_root
-        return found
+            later = from_time[k]
+            np.matmul(by_z[k, later:], f[k - 1], out=by_z[k - 1, later:])
+        noises = by_z[1:, :, self._noisy] * self._sigma
+        return np.hstack([by_z[0] @ first_root, noises.transpose(1, 0, 2).reshape(count, -1)])
 
     def _moved(self, f: Array, defects: Array, first: Array, xi: Array, first_root: Array) -> Array:
         """Step ``(m + 1, n)`` of the trajectory for standardized unknowns."""
