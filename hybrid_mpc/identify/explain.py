@@ -97,6 +97,8 @@ both models have small errors have little influence."""
 FEWEST, MANY = 3, 5
 """Minimum number of pieces of evidence for an interval; number of recordings from which on each recording is one
 piece."""
+GENERIC = ("product", "coupling")
+"""Laws that are no candidates where all evidence is one recording: they follow whatever differs within it."""
 LEAST_T = 2.0
 """Minimum t-ratio: at least one weight of each new term must differ from zero by this many standard errors."""
 LEAST = 20
@@ -496,6 +498,12 @@ def _with_state(terms: Sequence[Term]) -> list[Term]:
     return [term for term in terms if term.state is not None]
 
 
+def _is_generic(candidate: Candidate) -> bool:
+    """Whether a candidate is a product or a coupling: these imitate other effects, and need several recordings."""
+    made = candidate.forms[0].made
+    return made is not None and made.maker in GENERIC
+
+
 def _vanishes(term: Term) -> bool:
     """Whether a term is zero at its nominal values, so that derivatives predict its effect."""
     return term.state is None and term.parameters[0].value == 0.0
@@ -670,6 +678,8 @@ class _Explain:
         spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
         self.search = _Search(base, dt, self.evidence, short, sizes, points, spread)
         given = library(prior, points, dt, length) if candidates is None else candidates
+        if self.evidence.told.recordings == 1:
+            given = [one for one in given if not _is_generic(one)]
         self.pool = [*given, *(Candidate(term.name, (term,)) for term in own)]
         _check(prior, self.pool, own, points)
         self.candidates = len(self.pool)

@@ -20,7 +20,7 @@ from hybrid_mpc import (
 )
 from hybrid_mpc.identify import term_table
 from hybrid_mpc.identify.explain import _Explain, explain
-from hybrid_mpc.identify.explanation import Explanation
+from hybrid_mpc.identify.explanation import Explanation, HeldOutError
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import visited
 from hybrid_mpc.identify.term_library import Candidate, library
@@ -363,6 +363,30 @@ def test_a_short_recording_is_fewer_pieces_of_evidence():
     assert short.pieces == 4
     assert long.pieces == 8
     assert short.text == "4 blocks of one recording in 5 groups"
+
+
+def test_products_need_several_recordings():
+    dry = Candidate("dry", (terms.coulomb("phi_dot", Parameter("F_c", 0.0, "N m", 0.0, 1.0), width=0.05),))
+    made = terms.product("phi_dot", Parameter("k", 0.0, "1/s^2", -1.0, 1.0), one="phi", two="phi")
+    pool = dry, Candidate("product", (made,))
+    assert [
+        begun(runs=recorded(Pendulum(), n, 20.0), candidates=pool, most=0).candidates for n in (1, 2)
+    ] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("recordings", "ratio", "added"), [(1, 0.8, 0), (1, 0.6, 1), (5, 0.8, 1), (5, 0.9, 0)]
+)
+def test_a_single_recording_must_show_more(recordings, ratio, added):
+    told = SimpleNamespace(recordings=recordings)
+    found = HeldOutError(error=0.1, ratio=ratio, lower=0.5, upper=0.95, harm=0.0)
+    search = SimpleNamespace(
+        evidence=SimpleNamespace(told=told, compared=lambda *squares: found),
+        now=SimpleNamespace(squares=np.ones((2, 3)), terms=()),
+        _at_bounds=lambda forms, theta: [],
+    )
+    judged = _Explain._judged(search, (), np.zeros(1), 0.5 * np.ones((2, 3)), 10, [])
+    assert judged.sure == bool(added)
 
 
 def test_the_page_of_terms_is_that_of_the_library():
