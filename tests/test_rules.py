@@ -94,7 +94,7 @@ RECORDS = (
     BenchmarkBudget(4, 1, 5, 5, 10),
     BenchmarkSpec({}, units={"y": ("mm", 1e3)}, length=1.0),
     Task("hold", "Hold", 1.0, (0.0, 0.0), lambda t: np.zeros((len(t), 2))),
-    Budget(4, 1, 5, 5, 1),
+    Budget(4, 1, 5, 5, seeds=1),
     Scenario("mine", "Mine", "text", lambda values=None: None, SPEC, control=CONTROL, sensor_sigma=(1e-3,)),
     Fault(0.0, 1.0, "input_gain", 0.5, "u", 0.1),
     Balance("energy", 1.0, 1.0),

@@ -76,7 +76,7 @@ def both_ways(prior: Prior) -> str:
         abs(a - b) > 1e-9 * max(1.0, abs(b)) for a, b in zip(holding.x, rest_of(prior)[0], strict=True)
     ):
         inputs += f" with x = {_numbers(holding.x)}"
-    return f"The states that this input holds: {states}. The input that holds these states: {inputs}"
+    return f"States that your input holds: {states}. Input that holds your states: {inputs}"
 
 
 def sizes_of(signals: tuple[Signal, ...], at: Array) -> Array:

@@ -143,10 +143,29 @@ def summary(results: Results) -> list[str]:
         lines += loop_lines(loops)
     if not isinstance(results.on_model, Absent):
         lines += on_model_lines(results.on_model)
+    lines += track_lines(results)
     lines += watch_lines(results.watch)
     if isinstance(results.promises, Absent):
         return [*lines, f"promises of the kit: not tested: {results.promises.reason}"]
     return lines + promise_lines(results.promises.rows)
+
+
+def track_lines(results: Results) -> list[str]:
+    """The tracked parameters of a run with --track."""
+    from hybrid_mpc.workflow.stage import Absent
+
+    found = results.track
+    if isinstance(found, Absent):
+        return []
+    units = {p.name: p.unit for p in found.varying.parameters}
+    names = ", ".join(f"{one.name} ({one.words(units[one.name])})" for one in found.tracking.tracked)
+    if not names:
+        return ["tracked parameters: none, since tracking improves no prediction"]
+    ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in found.tracking.ratio.items())
+    return [
+        f"tracked parameters, with their standard deviations: {names}; errors of predictions over those without "
+        f"tracking: {ratios}"
+    ]
 
 
 def loop_lines(found: ControlResult) -> list[str]:

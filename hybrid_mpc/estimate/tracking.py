@@ -70,6 +70,15 @@ class TrackedParameter:
     def __post_init__(self) -> None:
         Fields(self, f"tracked parameter {self.name!r}").refuse()
 
+    def words(self, unit: str) -> str:
+        """Its standard deviation as text; ``unit`` is the parameter's.
+
+        Example:
+            >>> TrackedParameter("gain", 0.2, relative=True).words("V"), TrackedParameter("bias", 0.5).words("V")
+            ('20 %', '0.5 V')
+        """
+        return f"{100 * self.std:.3g} %" if self.relative else f"{self.std:.3g} {unit}"
+
 
 def is_relative(parameter: Parameter) -> bool:
     """Whether the deviations of a parameter are relative: its bounds exclude zero, as those of a time constant.

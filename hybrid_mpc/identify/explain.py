@@ -105,6 +105,8 @@ LEAST = 20
 """Minimum periods of a part of a single recording."""
 ALONG = 4
 """Integration steps of a period for a term's state along a recording."""
+FEW = 6
+"""Iterations over the long windows that score a lag."""
 LOWERED = 0.99
 """Ratio of errors over all windows that a candidate must fall below before it is fitted in every fold."""
 MEMORY = 3.0
@@ -402,6 +404,19 @@ class _Search:
     def by_short_windows(self, terms: Terms, start: Array) -> Array:
         """Fit to the short windows."""
         return self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
+
+    def slow_score(self, terms: Terms, theta: Array, ends: float) -> float:
+        """Logarithm of the ratio of errors with a lag: derivatives at its nominal value do not predict its effect.
+
+        The better of a fit to the short windows, and a few iterations over the long ones: in short windows the first
+        states explain a part of a lag.
+        """
+        start = self.start(terms, theta)
+        fits = [
+            self.by_short_windows(terms, start),
+            self.problem(terms, self.evidence.windows).solve(start, FEW).theta,
+        ]
+        return 0.5 * math.log(min(self.error(terms, one) for one in fits) / ends)
 
     def begun(self, terms: Terms, theta: Array) -> Fitted:
         """Fit to all windows, from ``theta`` of the terms without the last ones.
@@ -763,9 +778,7 @@ class _Explain:
             scores = []
             for form in one.forms:
                 try:
-                    terms = (*now.terms, form)
-                    theta = search.by_short_windows(terms, search.start(terms, now.theta))
-                    score = 0.5 * math.log(search.error(terms, theta) / ends)
+                    score = search.slow_score(terms=(*now.terms, form), theta=now.theta, ends=ends)
                 except (InputError, np.linalg.LinAlgError) as error:
                     diverged.append(Trial((_found(form),), "diverged", None, str(error)))
                     continue

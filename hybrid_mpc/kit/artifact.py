@@ -76,6 +76,8 @@ INPUTS = {
     "output": ("x", "u", "w", "p"),
     BALANCE: ("x", "xdot", "u", "w", "p"),
 }
+ONE_SIDED = 0.5
+"""Ratio of the deviations to both sides below which only the larger counts: a bound cuts off the smaller one."""
 RELEASED = 0.9
 """Share of a tracked parameter's limit at which its alarm ends."""
 OWN = ("step", "xdot")
@@ -289,13 +291,14 @@ def drift_limits(model: HybridModel, tracked: Sequence[TrackedParameter]) -> tup
     """Limits of a model's tracked parameters: their distance from the fitted value at three standard deviations.
 
     A parameter that drifts as it did between the recordings stays within them; beyond, the machine is another one, or
-    has a fault.
+    has a fault. The nearer side counts for both, except for a parameter near one of its bounds.
     """
     parameters = {p.name: p for p in model.parameters}
     found = []
     for one, low, high in zip(tracked, *tracked_range(model, tracked), strict=True):
         p = parameters[one.name]
-        far = max(high - p.value, p.value - low)
+        near, far = sorted((high - p.value, p.value - low))
+        far = near if near >= ONE_SIDED * far else far
         if far > 0:
             found.append(ChannelLimit(p.name, p.unit, 1, far, RELEASED * far))
     return tuple(found)

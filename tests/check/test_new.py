@@ -111,7 +111,7 @@ def test_a_room_that_no_input_affects_in_recordings_of_three_periods(call, tmp_p
     assert [s.name for s in prior.states] == ["Temperatur"]
     assert (prior.inputs[0].lower, prior.inputs[0].upper) == (0.0, 100.0)
     assert prior.values["T_Temperatur"] == pytest.approx(40.0, rel=0.05)
-    assert "slowest time constant that matters is 39.8 s" in told
+    assert "slowest significant time constant is 39.8 s" in told
     (sigma,) = re.findall(r"# sensor_sigma=\(([\d.]+),\)", machine.read_text())
     assert 0.15 <= float(sigma) < 0.2  # the machine's motion within three samples counts, too
     assert not [line for line in left_to_decide(machine) if "sensor_sigma" in line or "limits" in line]
@@ -122,7 +122,7 @@ def test_an_output_given_by_the_user_that_no_input_affects_sets_no_horizon(call,
     words = ("--output-column", "Raumtemperatur", "--output-column", "Temperatur")
     code, told, error = call("new", tmp_path / "oven.py", "--data", file, *words)
     assert code == 0, error
-    assert re.search(r"time constant that matters is .* of Temperatur", told)
+    assert re.search(r"significant time constant is .* of Temperatur", told)
 
 
 def test_a_recording_without_visible_noise_and_without_limits_leaves_both_to_decide(tmp_path):

@@ -85,7 +85,7 @@ CONTROL = OCP(10, (25, 0.25), (1,), (1,), (-1,), (1,))
 TASK = Task("hold", "Hold", 1.0, (0.1, 0.0), lambda t: np.zeros((len(t), 2)))
 GOOD = Scenario(
     "mine", "Mine", "", prior=Pendulum, data=DATA, control=CONTROL, sensor_sigma=(1e-3,), plant=Plant, tasks=(TASK,),
-    budgets={"quick": Budget(4, 1, 5, 5, 1)},
+    budgets={"quick": Budget(4, 1, 5, 5, seeds=1)},
 )  # fmt: skip
 
 

@@ -209,7 +209,7 @@ def test_free_runs_longer_than_any_test_piece_are_told():
     z = np.zeros((80, 1))
     piece = Trajectory("run", "test", 1.0, np.arange(80.0), z, z, z, z)
     (told,) = short_runs(spec, [piece])
-    assert "free runs of 100 s" in told
+    assert "free_run is 100 s" in told
     assert "70 s after its warm-up of 10 s" in told
     assert short_runs(replace(spec, free_run=70.0), [piece]) == ()
     assert short_runs(replace(spec, free_run=None), [piece]) == ()

@@ -19,7 +19,7 @@ from hybrid_mpc import (
     set_limits,
     set_process_noise,
 )
-from hybrid_mpc.compare.controllers import CONTROLLERS, ORACLES
+from hybrid_mpc.compare.controllers import COMPARED, CONTROLLERS, ORACLES
 from hybrid_mpc.compare.loops import MODEL, LoopSpec, limits_used
 from hybrid_mpc.compare.sequential import looks
 from hybrid_mpc.compare.summary import by_task, interval, summaries
@@ -153,7 +153,7 @@ def test_parts_are_every_loop_once_and_the_timed_ones_come_first():
     budget = GOLF.budgets["full"]
     parts = parts_of(GOLF, GOLF.tasks, budget, range(budget.seeds))
     loops = [(p.task.name, p.controller, seed) for p in parts for seed in p.seeds]
-    per_task = sum(_seeds(n, GOLF, budget.seeds, budget.oracle_seeds) for n in CONTROLLERS)
+    per_task = sum(_seeds(n, GOLF, budget.seeds, budget.oracle_seeds) for n in COMPARED)
     assert len(loops) == len(set(loops)) == per_task * len(GOLF.tasks)
     assert len({p.stage for p in parts}) == len(parts)
     assert [p.timed for p in parts] == sorted((p.timed for p in parts), reverse=True)
@@ -197,10 +197,11 @@ def test_a_task_that_is_decided_runs_no_further(monkeypatch):
 
 
 def test_every_controller_runs_and_oracles_less_often():
-    assert [_seeds(n, GOLF, 10, 2) for n in CONTROLLERS] == [10, 10, 10, 10, 2, 1]
-    assert [_seeds(n, GOLF, 10, 10) for n in CONTROLLERS] == [10, 10, 10, 10, 10, 1]
-    assert set(ORACLES) < set(CONTROLLERS)
-    assert len({(c.model, c.observer, c.truth) for c in CONTROLLERS.values()}) == len(CONTROLLERS)
+    assert [_seeds(n, GOLF, 10, 2) for n in COMPARED] == [10, 10, 10, 10, 2, 1]
+    assert [_seeds(n, GOLF, 10, 10) for n in COMPARED] == [10, 10, 10, 10, 10, 1]
+    assert set(ORACLES) < set(COMPARED)
+    own = [CONTROLLERS[name] for name in COMPARED]
+    assert len({(c.model, c.observer, c.truth) for c in own}) == len(own)
 
 
 SHORT = """
@@ -220,10 +221,10 @@ def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, j
     shutil.copytree(golf_artifact, out / "model")
     scenario = load_scenario(str(file))
     context = Context(RunSettings(str(file)), scenario, out)
-    set_process_noise(out / "model", {name: np.array([1e-4, 1e-2]) for name in CONTROLLERS})
+    set_process_noise(out / "model", {name: np.array([1e-4, 1e-2]) for name in COMPARED})
     rows = compare(context)
     assert [(r.controller, r.seed) for r in rows] == [
-        (name, seed) for name in sorted(set(CONTROLLERS) - set(ORACLES)) for seed in (0, 1)
+        (name, seed) for name in sorted(set(COMPARED) - set(ORACLES)) for seed in (0, 1)
     ]
     kept = sorted((out / "checkpoints" / "loops").glob("*.json"))
     assert len(kept) == 6  # two timed loops, what is left of their controllers, and two controllers whole
@@ -241,7 +242,7 @@ def test_a_comparison_that_was_killed_goes_on_from_what_it_kept(golf_artifact, j
                 np.testing.assert_array_equal(one.arrays[key], other.arrays[key])
     assert all(path.is_file() for path in kept)
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
-    set_process_noise(out / "model", {name: np.array([1e-4, 2e-2]) for name in CONTROLLERS})
+    set_process_noise(out / "model", {name: np.array([1e-4, 2e-2]) for name in COMPARED})
     other = compare(context)  # loops of another filter: none of those that are kept
     assert [r.controller for r in other] == [r.controller for r in rows]
     assert all(a.cost != b.cost for a, b in zip(other, rows, strict=True))

@@ -126,7 +126,7 @@ def command(context: Context, scenario: str = "") -> str:
     words = ["hybrid-mpc", "run", scenario or s.scenario, *s.options(lambda path: path.name)]
     words += ["--settings", s.network_file.name] if s.network_file else []
     words += ["--deploy", s.deploy] if s.deploy else []
-    words += ["--explain"] if s.explain else []
+    words += [flag for flag, given in (("--explain", s.explain), ("--track", s.track)) if given]
     return shlex.join([*words, "--seed", str(s.seed), "--budget", s.budget])
 
 
@@ -578,10 +578,10 @@ def _observer_table(found: EstimationResult) -> Table:
 
 def _varying_table(found: TrackResult) -> Table:
     """Parameters by their variation between recordings."""
-    tracked = {one.name for one in found.tracking.tracked}
+    tracked = {one.name: one for one in found.tracking.tracked}
     rows = [
         (f"{p.name} [{p.unit}]", p.value, p.std or "fixed", p.gain,
-         "yes" if p.name in tracked else "no")
+         tracked[p.name].words(p.unit) if p.name in tracked else "no")
         for p in found.varying.parameters
     ]  # fmt: skip
     of = "blocks of the recording" if found.varying.blocks else "recordings"
@@ -590,9 +590,11 @@ def _varying_table(found: TrackResult) -> Table:
         f" Prediction errors over {found.tracking.horizon:g} s with tracking, over those without: {ratios}."
     )
     return Table(
-        ("parameter", "fitted", "standard deviation", "evidence", "tracked"), rows,
-        f"Variation of the parameters between {found.varying.pieces} {of}; evidence is the gain of log evidence over a "
-        f"fixed parameter.{gain if tracked else ' Tracking improves no prediction.'}",
+        ("parameter", "fitted", "deviation, all together", "evidence, alone", "tracked with a deviation of"), rows,
+        f"Standard deviations of the parameters between {found.varying.pieces} {of}. If all parameters may vary, some "
+        "replace others: these are fixed. Evidence is the gain of log evidence where one parameter alone varies; a "
+        "tracked one has the deviation that it has alone, or among all."
+        + (gain if tracked else " Tracking improves no prediction."),
     )  # fmt: skip
 
 
