@@ -403,9 +403,10 @@ class _Judge:
         }
         for trait in self.open:
             if trait.said in kinds:
-                self._say(
-                    trait, kinds[trait.said], reasons.get(trait.said, BY_NAME), trait.said != "disturbance"
-                )
+                reason, sure = reasons.get(trait.said, BY_NAME), trait.said != "disturbance"
+                if trait.said == "set-point" and not self._is_followed(trait):
+                    reason, sure = f"{BY_NAME}, but no column follows it: it may be an input", False
+                self._say(trait, kinds[trait.said], reason, sure)
         # a drive's measurement of its command, or the second of two commands in series
         inputs = [t for t in self.of("input") if t.full not in self.given]
         for one in [t for t in inputs if t.said == "actuator"]:
@@ -413,6 +414,10 @@ class _Judge:
                 if is_command_of(other.full, one.full) or self._answers_to(one, other):
                     self._say(one, "none", f"it follows {other.full!r}: the drive's response to it")
                     break
+
+    def _is_followed(self, goal: Trait) -> bool:
+        """Whether another column follows a set-point: it explains half of that column's variance, with gain one."""
+        return any(follows(goal, t) >= 0.5 for t in self.traits.values() if t is not goal)
 
     def _answers_to(self, answer: Trait, command: Trait) -> bool:
         """Whether a column is a drive's measurement of a command."""

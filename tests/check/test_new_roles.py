@@ -191,6 +191,16 @@ def test_set_points_drive_where_nothing_else_does():
     }  # fmt: skip
 
 
+def test_a_set_point_that_nothing_follows_is_to_be_decided():
+    """The command of a jacket, by its name a set-point, and a feed: the jacket itself is not recorded."""
+    u, feed = steps(), np.cumsum(0.1 * np.random.default_rng(3).standard_normal(1500))
+    table = {"jacket_set": u, "feed": feed, "temp": 0.4 * lag(u, 60) + 0.2 * feed}
+    found = judge_roles([Trait(n, "", (v,)) for n, v in table.items()])
+    assert (found["jacket_set"].kind, found["jacket_set"].sure) == ("set-point", False)
+    followed = judge_roles([Trait(n, "", (v,)) for n, v in {**table, "jacket": lag(u, 3)}.items()])
+    assert followed["jacket_set"].sure
+
+
 def test_what_a_drive_measures_stands_in_for_a_command_that_is_not_recorded():
     u = steps()
     answer = lag(u, 2)
