@@ -3,8 +3,10 @@
     python benchmarks/load_pace.py --names ball_and_beam --steps 0.0006/0.005 0.0008/0.0065 --seeds 10
 
 A pace is ``quiet/slip``: the random walk of every load per period in the quiet and in the slip filter, as shares of the
-load's size. Everything else is that of the default observer, the process noise, too. The ratios are paired by seeds:
-geometric means with 95 % intervals over the default's loops.
+load's size. Everything else is that of the default observer, the process noise, too. ``--steps three`` is the default
+observer without its filter of outliers. ``--outliers 0.01`` puts samples off by 5 to 50 standard deviations in that
+share of the outputs' samples. The ratios are paired by seeds: geometric means with 95 % intervals over the default's
+loops.
 """
 
 from __future__ import annotations
@@ -24,9 +26,9 @@ from unknown.plants import Plant
 from unknown.processes import PROCESSES
 from unknown_loops import interval, prepared
 
-from hybrid_mpc import ExtendedKalmanFilter, SwitchingFilter
+from hybrid_mpc import Estimate, ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.control.sizes import disturbance_sizes
-from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter
+from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter
 from hybrid_mpc.kit.assembly import FIRST_LOAD, first_deviations, make_controller
 from hybrid_mpc.loop.loop import Loop
 
@@ -38,13 +40,30 @@ def observer_of(own: Made, quiet: float, slip: float) -> Filter:
     """The default observer with other random walks of the loads."""
     model, size = own.model, disturbance_sizes(own.model, own.control)
 
-    def filter_of(scale: float, share: float) -> ExtendedKalmanFilter:
+    def filter_of(scale: float, share: float, sensor: float = 1.0) -> ExtendedKalmanFilter:
         return ExtendedKalmanFilter(
-            model, sigma_y=own.sigma, sigma_x=scale * own.noise[0], sigma_x0=first_deviations(model, own.scenario),
-            sigma_d=share * size, sigma_d0=FIRST_LOAD * size,
+            model, sigma_y=sensor * own.sigma, sigma_x=scale * own.noise[0],
+            sigma_x0=first_deviations(model, own.scenario), sigma_d=share * size, sigma_d0=FIRST_LOAD * size,
         )  # fmt: skip
 
-    return SwitchingFilter([filter_of(1.0, quiet), filter_of(SLIP, slip), filter_of(1.0, JUMP)], SWITCHES)
+    modes = filter_of(1.0, quiet), filter_of(SLIP, slip), filter_of(1.0, JUMP), filter_of(1.0, quiet, OUTLIER)
+    return SwitchingFilter(modes, SWITCHES)
+
+
+class Spoiled:
+    """An observer whose samples have outliers in a ``share`` of them."""
+
+    def __init__(self, observer: Filter, sigma: np.ndarray, share: float, seed: int) -> None:
+        self.observer, self.sigma, self.share, self.rng = observer, sigma, share, np.random.default_rng(seed)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.observer, name)
+
+    def update(self, estimate: Estimate, y: np.ndarray, u: np.ndarray, **known: np.ndarray) -> Estimate:
+        """The observer's estimate after the spoiled sample."""
+        off = self.rng.uniform(5.0, 50.0, len(y)) * self.rng.choice([-1.0, 1.0], len(y)) * self.sigma
+        y = y + np.where(self.rng.random(len(y)) < self.share, off, 0.0)
+        return self.observer.update(estimate, y, u, **known)
 
 
 def moved(own: Made, loop: Ran) -> float:
@@ -52,14 +71,27 @@ def moved(own: Made, loop: Ran) -> float:
     return float(np.sum(np.abs(np.diff(loop.u, axis=0)) / (own.control.u_max - own.control.u_min)))
 
 
-def compared(name: str, plant: Plant, own: Made, trials: list[Trial], steps: list[str]) -> list[str]:
+def compared(
+    name: str, plant: Plant, own: Made, trials: list[Trial], steps: list[str], share: float
+) -> list[str]:
     """Rows of the table: the default observer, then each pace."""
     controller = make_controller(own.model, own.model, own.control, solver="native")
-    observers = {"default": own.parts[0]}
-    observers |= {one: observer_of(own, *(float(v) for v in one.split("/"))) for one in steps}
+    default = own.parts[0]
+    assert isinstance(default, SwitchingFilter)
+    observers: dict[str, Filter] = {"default": default}
+    for one in steps:
+        if one == "three":
+            usual = np.array(SWITCHES)[:3, :3]
+            observers[one] = SwitchingFilter(default.filters[:3], usual / usual.sum(axis=1, keepdims=True))
+        else:
+            observers[one] = observer_of(own, *(float(v) for v in one.split("/")))
     base, rows = list[Ran](), []
     for step, observer in observers.items():
-        loops = [ran(plant, own, trial, Own(Loop(observer, controller), own.held)) for trial in trials]
+        spoiled = [Spoiled(observer, own.sigma, share, i) if share else observer for i in range(len(trials))]
+        loops = [
+            ran(plant, own, trial, Own(Loop(each, controller), own.held))
+            for each, trial in zip(spoiled, trials, strict=True)
+        ]
         base = base or loops
         cost = interval([a.cost / b.cost for a, b in zip(loops, base, strict=True)])
         moves = np.mean([moved(own, a) / moved(own, b) for a, b in zip(loops, base, strict=True)])
@@ -77,8 +109,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--names", nargs="+", required=True, help="machines")
-    parser.add_argument("--steps", nargs="+", required=True, help="paces, quiet/slip")
+    parser.add_argument("--steps", nargs="+", required=True, help="paces, quiet/slip; three")
     parser.add_argument("--seeds", type=int, default=10, help="paired loops of each machine")
+    parser.add_argument("--outliers", type=float, default=0.0, help="share of outliers in the samples")
     given = parser.parse_args()
     print("| machine | quiet/slip | settled | cost over the default's | largest | moves |\n|" + " --- |" * 6)
     with tempfile.TemporaryDirectory() as folder:
@@ -86,7 +119,11 @@ def main() -> None:
             if machine.name in given.names:
                 plant, own = prepared(machine, Path(folder))
                 trials = trials_of(machine.name, plant, own, 0, given.seeds)
-                print(*compared(machine.name, plant, own, trials, given.steps), sep="\n", flush=True)
+                print(
+                    *compared(machine.name, plant, own, trials, given.steps, given.outliers),
+                    sep="\n",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

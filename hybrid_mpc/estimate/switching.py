@@ -21,9 +21,16 @@ NEGLIGIBLE = 0.01
 keep the quiet filter from becoming quiet."""
 SLIP = 10.0
 """Process noise, over the quiet one, while a machine slips: breakaway of friction, backlash, an impact."""
-SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
-"""Transition probabilities per period between three modes (quiet, slip, jump). At 50 Hz: a slip every second, a load
-change or a fault every 40 s; each lasts one or two periods."""
+OUTLIER = 1000.0
+"""Sensor noise, over the usual one, of an outlier. Samples count as outliers from 5.1 standard deviations on: there
+``exp(-5.1^2 / 2) = 0.002 / 1000``. With 20 that would be 4.3, but a load would be found later, and gross outliers move
+the estimate."""
+SWITCHES = (
+    (0.9775, 0.02, 0.0005, 0.002), (0.5, 0.4975, 0.0005, 0.002), (0.45, 0.05, 0.498, 0.002), (0.9795, 0.02, 0.0005, 0.0)
+)  # fmt: skip
+"""Transition probabilities per period between four modes (quiet, slip, jump, outlier). At 50 Hz: a slip every second, a
+load change or a fault every 40 s, an outlier every 10 s; slips and jumps last one or two periods. No outlier follows
+another at once: a filter that may ignore several samples also ignores a kick to the machine."""
 
 
 @dataclass(frozen=True)

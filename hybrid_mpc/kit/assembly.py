@@ -19,7 +19,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
-from hybrid_mpc.estimate.switching import SLIP, SWITCHES, Filter, SwitchingFilter
+from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import FOUND, choose_most_likely, remaining_load
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # what takes long to import is imported where it is made
     from hybrid_mpc.data.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-MODES = ("quiet", "slip", "jump")
+MODES = ("quiet", "slip", "jump", "outlier")
 """Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
 QUIET_SHARE = 0.0003
 """Standard deviation of the load's random walk per period in the quiet filter, as a share of the load's size (drift,
@@ -124,7 +124,7 @@ OBSERVERS: Mapping[str, Callable[..., ExtendedKalmanFilter]] = {
     "ukf": _unscented,
     "mhe": _moving_horizon,
 }
-"""Filters by kind of observer: ``switching`` between three extended Kalman filters, one ``ekf``, the unscented Kalman
+"""Filters by kind of observer: ``switching`` between four extended Kalman filters, one ``ekf``, the unscented Kalman
 filter ``ukf``, and the moving horizon estimator ``mhe``."""
 
 
@@ -204,7 +204,7 @@ def make_estimator(
 ) -> Filter:
     """Build the estimator of a model.
 
-    With ``observer``, the kind ``switching`` switches between three filters (:data:`MODES`). A single filter is either
+    With ``observer``, the kind ``switching`` switches between four filters (:data:`MODES`). A single filter is either
     fast enough for a push, but then passes the encoder's quantization on to the input, or quiet, but then takes a push
     for noise. The unknown loads are those of the model's ``disturbance_model``.
 
@@ -240,10 +240,11 @@ def make_estimator(
         )
 
     def filter_of(
-        scale: float, step: Array | None, make: Callable[..., ExtendedKalmanFilter] = ExtendedKalmanFilter
-    ) -> ExtendedKalmanFilter:
+        scale: float, step: Array | None, make: Callable[..., ExtendedKalmanFilter] = ExtendedKalmanFilter,
+        sensor: float = 1.0,
+    ) -> ExtendedKalmanFilter:  # fmt: skip
         return make(
-            model, sigma_y=np.array(scenario.sensor_sigma), sigma_x=scale * sigma_x, sigma_x0=first,
+            model, sigma_y=sensor * np.array(scenario.sensor_sigma), sigma_x=scale * sigma_x, sigma_x0=first,
             sigma_d=None if step is None else step * span, sigma_d0=None if step is None else FIRST_LOAD * span,
         )  # fmt: skip
 
@@ -259,8 +260,9 @@ def make_estimator(
     # jump: a load of 5 % of the drive's range is ordinary, a larger one takes a few periods
     modes = (
         filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, 0.05)),
+        filter_of(1.0, quiet, sensor=OUTLIER),
     )  # fmt: skip
-    _check_found(modes, SEARCHED * control.horizon, Sizes(model, control).states)
+    _check_found(modes[:3], SEARCHED * control.horizon, Sizes(model, control).states)
     return SwitchingFilter(modes, SWITCHES)
 
 

@@ -176,7 +176,7 @@ def test_observer_and_parameter_filter_switch_by_the_same_numbers(adaptive, golf
         observer, parameter_filter(adaptive, 2, sigma_y=[1e-4], sigma_x=sigma_x, sigma_x0=[1e-4, 0.1])
     ):  # fmt: skip
         np.testing.assert_array_equal(several.transition, SWITCHES)
-        quiet, slip, _ = (f.noise[0][:2] for f in several.filters)
+        quiet, slip, *_ = (f.noise[0][:2] for f in several.filters)
         np.testing.assert_allclose(slip, SLIP**2 * quiet, rtol=1e-12)
 
 
