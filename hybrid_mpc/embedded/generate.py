@@ -436,7 +436,7 @@ def _tables(
     reals: dict[str, Array] = {
         "u_min": ocp.u_min, "u_max": ocp.u_max, "u_scale": ocp.input_scale, "u_rest": model.u0, "x_rest": model.x0,
         "w_rest": model.w, "du_max": np.full(model.n_u, np.inf) if ocp.du_max is None else ocp.du_max,
-        "x_reach": np.array(problem.reach),
+        "x_reach": np.array(problem.reach), "x_usable": np.array(problem.usable),
         "q_x": ocp.q * dt, "r_u": ocp.r * dt, "r_delta": ocp.r_delta * dt, "terminal": problem.terminal,
         "disturbs_u": on_u, "disturbs_x": on_x,
         "soft_lower": soft.lower[kinds], "soft_upper": soft.upper[kinds],

@@ -44,6 +44,7 @@ void hmpc_run_free(hmpc_state *s, const real *u, int rows) {
     hmpc_model(plan->z[k], v, plan->w[k], plan->z[k + 1]);
     disturb_state(plan->d, plan->z[k + 1]);
     fine &= hmpc_all_finite(plan->z[k + 1], HMPC_NZ);
+    for (int i = 0; i < HMPC_NX; ++i) fine &= plan->z[k + 1][i] >= x_usable[0][i] && plan->z[k + 1][i] <= x_usable[1][i];
   }
   for (int k = 0; k < HMPC_N && !fine; ++k) memcpy(plan->z[k + 1], plan->z[0], sizeof plan->z[0]);
   plan->cost = R(NAN);
