@@ -255,7 +255,8 @@ def test_a_rate_and_a_follower():
         ("Sollwert", "", "set-point"), ("set_point_1", "", "set-point"), ("offset", "", "label"),
         ("reset", "", ""), ("spin", "", ""), ("Stellgröße", "", "command"), ("motor_voltage_meas", "", "answer"),
         ("q1_kw", "kW", ""), ("q1_rad", "rad", "quantity"), ("deg", "", ""), ("x", "", "quantity"),
-        ("y2", "", "measured"), ("force_y", "", ""),
+        ("y2", "", "measured"), ("force_y", "", ""), ("sog_kn", "kn", ""), ("thrust_kN", "kN", "actuator"),
+        ("gyro_dps", "deg/s", "measured"),
     ],
 )  # fmt: skip
 def test_what_a_name_says(name, unit, role):
