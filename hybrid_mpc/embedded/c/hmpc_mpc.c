@@ -571,8 +571,8 @@ static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows
     if (w) {
       memcpy(now, row_of(w, w_rows, k, HMPC_NW), sizeof now);
     } else if (k > 0 && goal && goal->w && goal->w_rows > 0) {
-      const real *const ahead = row_of(goal->w, goal->w_rows, k, HMPC_NW);
-      for (int i = 0; i < HMPC_NW; ++i)
+      const real *const ahead = row_of(goal->w, goal->w_rows, k, HMPC_MEASURED);
+      for (int i = 0; i < HMPC_MEASURED; ++i)
         if (hmpc_finite(ahead[i])) now[i] = ahead[i];
     }
     other |= memcmp(linear->w[k], now, sizeof now) != 0;
