@@ -85,9 +85,14 @@ def test_models_that_do_not_fit_are_refused():
 
 
 @pytest.fixture(scope="module")
-def kit(golf_artifact, tmp_path_factory):
-    folder = shutil.copytree(golf_artifact, tmp_path_factory.mktemp("blend") / "model")
-    save_loop(folder, loop_settings(hm.load_scenario("golf_robot"), NOISE))
+def folder(golf_artifact, tmp_path_factory):
+    place = shutil.copytree(golf_artifact, tmp_path_factory.mktemp("blend") / "model")
+    save_loop(place, loop_settings(hm.load_scenario("golf_robot"), NOISE))
+    return place
+
+
+@pytest.fixture(scope="module")
+def kit(folder):
     return hm.load(folder)
 
 
@@ -101,6 +106,15 @@ def test_a_kit_runs_prior_and_hybrid_side_by_side(kit):
     assert result.w.shape == (50, 1)
     assert result.w[0, 0] == 1.0
     assert np.ptp(result.w) > 0.0
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
+def test_its_c_has_the_share(folder, tmp_path, call):
+    code, _, err = call(
+        "export", "c", folder, "--blended", "--no-monitor", "--check", "--out", tmp_path / "c"
+    )
+    assert code == 0, err
+    assert "`s.w`: correction_share" in (tmp_path / "c" / "README.md").read_text()
 
 
 def test_a_kit_that_recommends_the_prior_asks_for_a_start(kit):
