@@ -3,14 +3,13 @@
     python benchmarks/ten_thousand.py [--periods 10000] [--only tanks] [--out FILE.json]
 
 Golf robot and disk are those of ``tests/golden`` with their trained networks. The others are priors with nominal
-parameters and small networks with random weights of several kinds; the tanks' sensor is bent. One more loop
-tracks parameters and the share of its network. Each loop begins alike,
-tracks the machine's task over and over, and has a frozen sensor and an input that is off. C gets Python's samples and
-the inputs that acted there: without these it would be a controller whose input nobody applies, and one with integral
-action adds rounding up. "own" is the largest difference of the input, of its range, of C that goes on from its own
-plans after the first, "handed" that of C that goes on from Python's plan in each period; "state" and "reading" are
-those of the estimate and of the monitor in the first of the two. The script ends with an error where an alarm, a mode,
-a source or a status differs in any period.
+parameters and small networks with random weights of several kinds; the tanks' sensor is bent. One more loop tracks
+parameters and the share of its network. Each loop begins alike, tracks the machine's task over and over, and has a
+frozen sensor and an input that is off. C gets Python's samples and the inputs that acted there: without these it would
+be a controller whose input nobody applies, and one with integral action adds rounding up. "own" is the largest
+difference of the input, of its range, of C that goes on from its own plans after the first, "handed" that of C that
+goes on from Python's plan in each period; "state" and "reading" are those of the estimate and of the monitor in the
+first of the two. The script ends with an error where an alarm, a mode, a source or a status differs in any period.
 """
 
 from __future__ import annotations

@@ -39,9 +39,9 @@ from hybrid_mpc.model.blend import BLEND_SHARE, blended, with_share
 TOLERANCE = 1e-9
 """As in ``test_whole_loops``: sums of another order, and steady states to 1e-9 of their scales; 4e-15 was found."""
 DT, SPAN, REST = 5.0, 2 * machines.PUMP, machines.rest_levels()
-PIPE = Parameter("pipe", machines.PIPE, "m^2", 0.8e-4, 1.4e-4)
+PIPE = Parameter("pipe", machines.PIPE, "m^2", 0.8e-4, 1.33e-4)
 LEAK = Parameter("leak", 0.0, "m^3/s", -2e-5, 2e-5, "of the upper tank")
-OUTLETS = TrackedParameter("pipe", 0.2, relative=True)
+OUTLETS = TrackedParameter("pipe", 0.4, relative=True)
 LEAKING = TrackedParameter("leak", 5e-6, time=7200.0)
 
 
@@ -80,7 +80,7 @@ class Changing(replays.MachinePlant):
 
     def step(self, state, u, dt, w=None):
         self._k += 1
-        pipe = 1.1 * PIPE.value if self._k < 2 * self._periods / 3 else 2.0 * PIPE.upper
+        pipe = 1.05 * PIPE.value if self._k < 2 * self._periods / 3 else 2.0 * PIPE.upper
         return super().step(state, u, dt, np.array([w[0], pipe, 4e-6]))
 
 
@@ -106,7 +106,7 @@ def case_of(model, prior, tracked, periods):
     return Case(
         estimator, safe, Monitor(ResidualReadings(estimator.model), limits), make_resting_guard(model),
         Changing(periods), reference, model.x0, periods, w=inflow,
-        faults=(replays.lost(0.4 * t, 0.45 * t), replays.freezes(0.62 * t, 0.66 * t)),
+        faults=(replays.lost(0.4 * t, 0.45 * t), replays.freezes(0.62 * t, 0.7 * t)),
     )  # fmt: skip
 
 
