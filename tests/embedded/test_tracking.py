@@ -1,5 +1,6 @@
 """Tracked parameters and the blend in C: a period is one of Python's loop, on tanks that change."""
 
+import ctypes
 import subprocess
 from dataclasses import replace
 from functools import cache
@@ -30,7 +31,7 @@ from hybrid_mpc import (
     WatchLimits,
 )
 from hybrid_mpc.embedded.generate import make_sources, sources_of
-from hybrid_mpc.embedded.native import NativeController
+from hybrid_mpc.embedded.native import NativeController, load_library
 from hybrid_mpc.estimate.tracking import TrackingFilter, with_tracked
 from hybrid_mpc.kit.artifact import drift_limits
 from hybrid_mpc.kit.assembly import make_resting_guard
@@ -43,6 +44,7 @@ PIPE = Parameter("pipe", machines.PIPE, "m^2", 0.8e-4, 1.33e-4)
 LEAK = Parameter("leak", 0.0, "m^3/s", -2e-5, 2e-5, "of the upper tank")
 OUTLETS = TrackedParameter("pipe", 0.4, relative=True)
 LEAKING = TrackedParameter("leak", 5e-6, time=7200.0)
+SHARE = TrackedParameter(BLEND_SHARE.name, 0.3)
 
 
 def tanks(network=None):
@@ -117,19 +119,23 @@ def changing():
     return case, replays.run(case)
 
 
-@cache
-def side_by_side():
-    """Prior and hybrid, with the share of the correction and the outlets tracked."""
+def blend(cell):
+    """Prior and hybrid side by side, with a network of torch's ``cell``."""
     torch = pytest.importorskip("torch")
     from test_network_layers import Cells
 
     from nn_export import to_casadi
 
     torch.manual_seed(0)
-    net = Cells(torch.nn.GRUCell, 6).double().eval()
+    net = Cells(getattr(torch.nn, cell), 6).double().eval()
     none = torch.zeros(4, dtype=torch.double), torch.zeros(net.hidden, dtype=torch.double)
-    model = blended(tanks(), tanks(to_casadi(net, none)))
-    case = case_of(model, with_share(tanks()), (OUTLETS, TrackedParameter(BLEND_SHARE.name, 0.3)), 120)
+    return blended(tanks(), tanks(to_casadi(net, none)))
+
+
+@cache
+def side_by_side():
+    """The share of the correction and the outlets are tracked."""
+    case = case_of(blend("GRUCell"), with_share(tanks()), (OUTLETS, SHARE), 120)
     return case, replays.run(case)
 
 
@@ -151,6 +157,38 @@ def test_a_loop_that_tracks_replayed(make, tmp_path):
     assert w[-1, 1] > 0.98 * PIPE.upper  # at its bound
     assert np.ptp(w[n // 2 : 3 * n // 5, 1]) < 0.02 * PIPE.value  # rests without excitation
     assert np.ptp(w[:, 2]) > 0.1 * case.estimator.tracked[1].std
+
+
+@needs_compiler
+@pytest.mark.parametrize("cell", ["GRUCell", "LSTMCell"])
+def test_slopes_by_tracked_parameters(cell):
+    """Through the network, which sees a rate of the prior; an LSTM is written as layers."""
+    base = blend(cell)
+    model, ocp = with_tracked(base, (OUTLETS, SHARE)), OCP(4, [1.0, 1.0], [1.0], [1.0], [0.0], [SPAN])
+    estimator = TrackingFilter(parts.filters_of(base, ocp), (OUTLETS, SHARE))
+    c, rng = (
+        load_library(make_sources(model, ocp, estimator=estimator), parts.QUICK).c,
+        np.random.default_rng(0),
+    )
+    point = [ca.MX.sym(name, n) for name, n in (("x", 2), ("h", base.n_h), ("u", 1), ("w", 3))]
+    z_next = ca.vertcat(*model.step(*point, model.p))
+    slopes = ca.Function("slopes", point, [ca.jacobian(z_next, by) for by in point])
+    n = 2 + base.n_h
+    wide = -(-n // 8) * 8
+    for _ in range(3):
+        z, u, w = (
+            np.zeros(wide),
+            rng.uniform(0.3, 1.0, 1) * SPAN,
+            np.array([4e-5, 1.1e-4, rng.uniform(0.2, 1.8)]),
+        )
+        z[:2], z[2:n] = rng.uniform(0.2, 0.5, 2), rng.uniform(-0.9, 0.9, base.n_h)
+        after, slope = np.zeros(wide), np.zeros((n, wide + 3))
+        c.hmpc_model_slope(*(ctypes.c_void_p(v.ctypes.data) for v in (z, u, w, after, slope)))
+        wanted = np.hstack([v.full() for v in slopes(z[:2], z[2:n], u, w)])
+        wanted = np.delete(wanted, n + 1, axis=1)  # by the inflow
+        found = np.delete(slope, np.s_[n:wide], axis=1)
+        np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-11 * np.max(np.abs(wanted)))
+        assert np.all(wanted[2:, n + 1] != 0.0)  # the hidden state follows the outlets
 
 
 @needs_compiler
