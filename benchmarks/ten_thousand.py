@@ -31,7 +31,7 @@ import replay_parts as replays
 import torch
 from golden_parts import Parts, machine
 from replay_parts import Case, Whole, replay
-from test_networks import Cells, Deep
+from test_network_layers import Cells, Deep
 
 from hybrid_mpc import (
     OCP,
@@ -193,7 +193,7 @@ MACHINES = (
     ),
     Machine(
         "temperature_lab",
-        gru(6),
+        gru(16),
         "set_points",
         tracked=(TrackedParameter("P1", 0.15, relative=True), TrackedParameter("tau", 0.2, relative=True)),
     ),
