@@ -44,6 +44,9 @@ VECTORS = 25
 TOLERANCE = {False: 1e-9, True: 1e-3}
 """Tolerance of the test, double and single precision: inputs over their range, states over their size. In single
 precision (seven digits) the QP limits the accuracy."""
+ROUNDED = 100.0
+"""Deviations of C from Python that count as rounding, over those by one rounding error of the samples: a step adds up
+hundreds of numbers, in C in another order."""
 OTHERS = ("hmpc_test.c", "Makefile", "CMakeLists.txt")
 MONITOR_README = """\
 `hmpc_finish` runs the monitor on @WATCHED@. `s.monitor.alarm` is 1 during an alarm; the other fields of `s.monitor`
@@ -99,19 +102,19 @@ def write_controller(
     texts = {name: template(name) for name in (*HEADERS, *SOURCES, *OTHERS)} | dict(found.texts)
     for name in ("Makefile", "CMakeLists.txt"):
         texts[name] = texts[name].replace("@SOURCES@", " ".join(sources_of(found)))
-    texts["hmpc_vectors.h"] = _vectors(safe, estimator, single, monitor)
+    tolerance, texts["hmpc_vectors.h"] = _vectors(safe, estimator, single, monitor)
     with replacing_folder(folder) as new:
         for name, text in texts.items():
             write_text(new / name, text)
         sizes = checked(new, sources_of(found)) if check else None
-        write_text(new / "README.md", _readme(model, found, sizes, single))
+        write_text(new / "README.md", _readme(model, found, sizes, single, tolerance))
     return found
 
 
 def _vectors(
     safe: SafeController, estimator: Filter | TrackingFilter | None, single: bool, monitor: Monitor | None
-) -> str:
-    """Test vectors: a short loop on the model itself, from the operating point towards a set-point near it."""
+) -> tuple[float, str]:
+    """Tolerance and vectors of the test: a short loop on the model itself, from the operating point to one near it."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.sizes.states
     tolerated = (
@@ -131,13 +134,7 @@ def _vectors(
     for _ in range(VECTORS):
         u = safe.controller.problem.u_rest if decision is None else decision.u
         y = model.output(z[:n_x], u, acting, model.p).full().ravel() + sigma * rng.standard_normal(model.n_y)
-        if estimator is None:
-            empty = np.zeros(model.n_d)
-            estimate = Estimate(0.0, z[:n_x], z[n_x:], empty, np.zeros((0, 0)), y, 0.0, w=model.w)
-        elif estimate is None:
-            estimate = estimator.start(y, w=model.w)
-        else:
-            estimate = estimator.update(estimate, y, u, w=model.w)
+        estimate = _estimated(model, estimator, estimate, z, y, u)
         if monitor is not None:
             memory, reading = monitor.update(memory, y, u, estimate)
             readings.append(_numbers(reading))
@@ -146,6 +143,7 @@ def _vectors(
         rows.append((y, model.w, estimate.x, estimate.h, decision.u))
         step = model.step(z[:n_x], z[n_x:], decision.u, acting, model.p)
         z = np.concatenate([v.full().ravel() for v in step])
+    rounding = _rounding(safe, estimator, rows, goal)
     columns = zip("ywxhu", (np.array(c) for c in zip(*rows, strict=True)), strict=True)
     tables = [table(f"vector_{name}", values) for name, values in columns]
     tables += [table("vector_goal", goal[None]), table("vector_x_size", size)]
@@ -155,11 +153,46 @@ def _vectors(
         largest = np.max(np.nan_to_num(np.abs(found)), axis=0)
         tables.append(table("vector_reading", found))
         tables.append(table("vector_reading_size", np.where(largest > 0, largest, 1.0)))
-    head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({TOLERANCE[single]!r})\n"
-    return (
-        "/* Decisions of the Python controller in a short loop, generated. */\n"
-        f"#ifndef HMPC_VECTORS_H\n#define HMPC_VECTORS_H\n{head}{''.join(tables)}#endif\n"
-    )
+    tolerance = max(TOLERANCE[single], ROUNDED * rounding)
+    head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({tolerance!r})\n"
+    text = "/* Decisions of the Python controller in a short loop, generated. */\n"
+    return tolerance, f"{text}#ifndef HMPC_VECTORS_H\n#define HMPC_VECTORS_H\n{head}{''.join(tables)}#endif\n"
+
+
+def _estimated(
+    model: HybridModel, estimator: Filter | TrackingFilter | None, before: Estimate | None, z: Array, y: Array,
+    u: Array,
+) -> Estimate:  # fmt: skip
+    """Estimate after a sample ``y``; without an estimator that of the states and hidden states ``z``."""
+    if estimator is None:
+        none = np.zeros((0, 0))
+        return Estimate(0.0, z[: model.n_x], z[model.n_x :], np.zeros(model.n_d), none, y, 0.0, w=model.w)
+    if before is None:
+        return estimator.start(y, w=model.w)
+    return estimator.update(before, y, u, w=model.w)
+
+
+def _rounding(
+    safe: SafeController,
+    estimator: Filter | TrackingFilter | None,
+    rows: Sequence[tuple[Array, ...]],
+    goal: Array,
+) -> float:
+    """Largest change of an input, over its range, if every sample changes by a rounding error.
+
+    Plans of an unstable machine depend on their start exponentially, and so does what rounding makes of them.
+    """
+    model, rng = safe.controller.model, np.random.default_rng(1)
+    eps, estimate, decision, largest = float(np.finfo(float).eps), None, None, 0.0
+    for y, _, x, h, want in rows:
+        u = safe.controller.problem.u_rest if decision is None else decision.u
+        z = np.concatenate([x, h])
+        z, y = (v * (1.0 + eps * rng.choice([-1.0, 1.0], v.size)) for v in (z, y))
+        estimate = _estimated(model, estimator, estimate, z, y, u)
+        decision = safe.initial(estimate) if decision is None else decision
+        decision = safe.decide(decision, estimate, goal[None])
+        largest = max(largest, float(np.max(np.abs(decision.u - want) / safe.controller.ocp.input_range)))
+    return largest
 
 
 def _numbers(reading: Reading) -> Array:
@@ -277,7 +310,9 @@ def operations(found: Sources) -> dict[str, int]:
     )
 
 
-def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single: bool) -> str:
+def _readme(
+    model: HybridModel, found: Sources, sizes: Footprint | None, single: bool, tolerance: float
+) -> str:
     n = found.sizes
     rows = "".join(f"| {name} | {count:,} |\n" for name, count in operations(found).items())
     if sizes is None:
@@ -292,7 +327,7 @@ def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single:
     values: Mapping[str, object] = {
         "NAME": markdown(model.name), "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
         "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
-        "DT": model.dt, "TOLERANCE": TOLERANCE[single],
+        "DT": model.dt, "TOLERANCE": f"{tolerance:.2g}",
         "MONITOR": _monitor_readme(n), "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
         "ESTIMATOR": _estimator_readme(model, n),
         "FILES": ", ".join(f"`{name}`" for name in GENERATED),
