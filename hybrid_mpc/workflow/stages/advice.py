@@ -37,8 +37,8 @@ def advice(results: Results, *, explained: bool = False, declared: Sequence[floa
         ``[hint.finding for hint in advice(read_results(path)) if hint.verdict == "bad"]``
     """
     found = [
-        *_doubt(results), *_recordings(results), *_prior(results, explained), *_choice(results, explained),
-        *_linear(results), *_floor(results, declared), *_bands(results), *_promises(results), *_loops(results),
+        *_doubt(results), *_recordings(results), *_prior(results, explained), *_tracked(results),
+        *_choice(results, explained), *_linear(results), *_floor(results, declared), *_bands(results), *_promises(results), *_loops(results),
         *_watching(results),
     ]  # fmt: skip
     if closed_loops(results.control) is not None and not any(hint.verdict == "bad" for hint in found):
@@ -107,6 +107,11 @@ def _prior(results: Results, explained: bool) -> Iterator[Hint]:
                 "Check signs and units. Look for a missing term, in the sensor equation too. A network can only "
                 "correct small errors." + ("" if explained else f" {SEARCH}"),
             )  # fmt: skip
+
+
+def _tracked(results: Results) -> Iterator[Hint]:
+    for doubt in () if isinstance(results.track, Absent) else results.track.tracking.doubts:
+        yield Hint("bad", f"Tracking: {doubt}.", "Add the missing term, then run again with --track.")
 
 
 def _choice(results: Results, explained: bool) -> Iterator[Hint]:
