@@ -210,7 +210,14 @@ def test_a_load_that_stays_beside_an_unlearned_parameter_is_doubted():
     fit, found = varying_of(Heater, recorded(GAINS))
     made = observer(fit)
     blaming = made.same_on(
-        made.model, sigma_y=[0.5], sigma_x=[0.5], sigma_x0=[0.1], sigma_d=[0.1], sigma_d0=[2.0], sigma_h=[], sigma_h0=[]
+        made.model,
+        sigma_y=[0.5],
+        sigma_x=[0.5],
+        sigma_x0=[0.1],
+        sigma_d=[0.1],
+        sigma_d0=[2.0],
+        sigma_h=[],
+        sigma_h0=[],
     )
     gain = found.parameters[0].tracked()
     (doubt,) = _unlearned(blaming, recorded(GAINS[:3], seconds=10.0, seed=5), (gain,))

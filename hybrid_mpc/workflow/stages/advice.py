@@ -38,8 +38,8 @@ def advice(results: Results, *, explained: bool = False, declared: Sequence[floa
     """
     found = [
         *_doubt(results), *_recordings(results), *_prior(results, explained), *_tracked(results),
-        *_choice(results, explained), *_linear(results), *_floor(results, declared), *_bands(results), *_promises(results), *_loops(results),
-        *_watching(results),
+        *_choice(results, explained), *_linear(results), *_floor(results, declared), *_bands(results),
+        *_promises(results), *_loops(results), *_watching(results),
     ]  # fmt: skip
     if closed_loops(results.control) is not None and not any(hint.verdict == "bad" for hint in found):
         found.append(
