@@ -9,7 +9,7 @@ from hybrid_mpc.compare.sequential import hardest
 from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
-from hybrid_mpc.rules import counted
+from hybrid_mpc.rules import counted, time_text
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.compare import REPORTED, closed_loops
 from hybrid_mpc.workflow.stages.promises import SEARCH, STRUCTURE
@@ -215,8 +215,8 @@ def _loops(results: Results) -> Iterator[Hint]:
     ms = None if isinstance(results.control, Absent) else results.control.step_ms
     if ms is not None and ms.p99 > ms.period:
         yield Hint(
-            "bad", f"Controller step time: the 99th percentile is {ms.p99:.3g} ms of wall time, but the period "
-            f"is {ms.period:g} ms.",
+            "bad", f"Controller step time: the 99th percentile is {time_text(ms.p99)} of wall time, but the "
+            f"period is {time_text(ms.period)}.",
             "Measure again on an idle computer. Else use the solver native (compiled C), a shorter horizon or a "
             "longer dt.",
         )  # fmt: skip
