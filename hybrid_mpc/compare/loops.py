@@ -160,7 +160,8 @@ class LoopSpec:
     @cached_property
     def id(self) -> str:
         """The first 20 hexadecimal digits of the SHA-256 of the specification's JSON form."""
-        return digest({k: v for k, v in asdict(self).items() if k not in ("number", "keep")})[:20]
+        left_out = ("number", "keep", *(("share",) if self.share is None else ()))
+        return digest({k: v for k, v in asdict(self).items() if k not in left_out})[:20]
 
     @property
     def noise_seed(self) -> int:
