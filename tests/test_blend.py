@@ -10,6 +10,7 @@ from online_models import make_filter, pendulum_model
 
 import hybrid_mpc as hm
 from hybrid_mpc.compare.loops import Bench, LoopSpec
+from hybrid_mpc.compare.study import Study
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
 from hybrid_mpc.kit.parts import loop_settings, save_loop
 from hybrid_mpc.model.blend import BLEND_SHARE, blended, with_share
@@ -122,6 +123,35 @@ def test_a_kit_that_recommends_the_prior_asks_for_a_start(kit):
     with pytest.raises(hm.InputError, match="HM-KIT-042"):
         careful.blended()
     assert careful.blended(0.5).models["hybrid"].p[-1] == 0.5
+
+
+def test_a_study_gives_the_blend_its_start(kit):
+    """Also where the prior is recommended; controllers without a blend have no share."""
+    study = Study(
+        "golf_robot",
+        "m",
+        ["track_step"],
+        ["prior_observer", "blended_observer"],
+        seeds=1,
+        duration=0.4,
+        share=0.5,
+    )
+    specs = {spec.controller: spec for spec in study.runs()}
+    assert {name: spec.share for name, spec in specs.items()} == {
+        "prior_observer": None,
+        "blended_observer": 0.5,
+    }
+    bench = Bench(hm.load_scenario("golf_robot"), {"model": replace(kit, recommended="prior")})
+    own = specs["blended_observer"]
+    assert bench.run(own)[1].w[0, 0] == 0.5
+    assert own.id != replace(own, share=None).id
+    with pytest.raises(hm.InputError, match="HM-KIT-042"):
+        bench.run(replace(own, share=None))
+    with pytest.raises(hm.InputError, match="HM-COMPARE-061"):
+        replace(study, controllers=("prior_observer",))
+    for share in (0.0, 2.0):
+        with pytest.raises(hm.InputError, match="HM-COMPARE-062"):
+            replace(study, share=share)
 
 
 @pytest.mark.parametrize("share", [0.0, 2.0, np.nan])

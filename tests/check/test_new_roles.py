@@ -201,6 +201,16 @@ def test_a_set_point_that_nothing_follows_is_to_be_decided():
     assert followed["jacket_set"].sure
 
 
+def test_a_set_point_that_nothing_follows_is_no_sign_of_a_closed_loop(tmp_path):
+    u, feed = steps(), steps(seed=3)
+    table = {"jacket_set": u, "feed": feed, "temp": 0.4 * lag(u, 60) + 0.2 * lag(feed)}
+    for name, more in (("a", {}), ("b", {"jacket": lag(u, 3)})):
+        file = write_csv(tmp_path / f"{name}.csv", {"t": np.arange(1500.0), **table, **more})
+        draft = write_scenario(tmp_path / f"{name}.py", file, inputs=["feed"], outputs=["temp"])
+        assert [c.full for c in draft.set_points] == ["jacket_set"]
+        assert bool(draft.loop) == bool(more)
+
+
 def test_what_a_drive_measures_stands_in_for_a_command_that_is_not_recorded():
     u = steps()
     answer = lag(u, 2)
