@@ -16,7 +16,6 @@ from hybrid_mpc.check.first_model import CLOSED, Lag, Runs, feedback_of, first_l
 from hybrid_mpc.check.roles import Kind, Trait, Verdict, driven, judge_roles
 from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.files import opened
-from hybrid_mpc.data.names import ANGLES
 from hybrid_mpc.data.recording import MIN_SCORED, read_recordings
 from hybrid_mpc.data.scales import noise_of, robust_spread
 from hybrid_mpc.data.source import Source, name_and_unit
@@ -25,7 +24,7 @@ from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_text
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
-from hybrid_mpc.machine.units import per_second
+from hybrid_mpc.machine.units import per_second, turn_in
 from hybrid_mpc.records import shown
 from hybrid_mpc.rules import LARGEST
 
@@ -374,22 +373,27 @@ def _in_loop(draft: Draft) -> Draft:
 
 def _unwrap(paths: Sequence[Path], draft: Draft) -> Draft:
     """The draft with wrapped angles unwrapped; checks that the recordings can be read with it."""
-    trial = replace(draft, outputs=tuple(replace(c, periodic=c.unit in ANGLES) for c in draft.outputs))
+    groups = (draft.outputs, draft.disturbances)
+    outputs, others = (
+        tuple(replace(c, periodic=turn_in(c.unit) is not None) for c in group) for group in groups
+    )
+    trial = replace(draft, outputs=outputs, disturbances=others)
     recordings, problems = read_recordings(
         paths, Roles.of(trial), trial.data(SMOOTHED * draft.period, 2 * draft.period)
     )
     refuse(problems)
     wrapped = {finding.channel for one in recordings for finding in one.findings if finding.kind == "wrapped"}
-    values = np.concatenate([one.y for one in recordings]).T
-    return replace(
-        draft,
-        outputs=tuple(
-            replace(c, periodic=True, values=own, lengths=tuple(len(one.y) for one in recordings))
-            if c.full in wrapped
-            else c
-            for c, own in zip(draft.outputs, values, strict=True)
-        ),
+    lengths = tuple(len(one.y) for one in recordings)
+    outputs, others = (
+        tuple(
+            replace(c, periodic=True, values=own, lengths=lengths) if c.full in wrapped else c
+            for c, own in zip(group, np.concatenate(values).T, strict=True)
+        )
+        for group, values in zip(
+            groups, ([one.y for one in recordings], [one.w for one in recordings]), strict=True
+        )
     )
+    return replace(draft, outputs=outputs, disturbances=others)
 
 
 def _at_rest(paths: Sequence[Path], draft: Draft) -> list[str]:
