@@ -8,10 +8,10 @@ from hybrid_mpc import (
     CondensedController,
     ExtendedKalmanFilter,
     Loop,
-    NativeController,
     SafeController,
     SwitchingFilter,
 )
+from hybrid_mpc.embedded.native import NativeController
 
 
 def observer():
