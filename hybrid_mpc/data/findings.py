@@ -159,8 +159,7 @@ class Channel:
                 )
                 if signal.periodic:
                     told = (
-                        f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped. An estimator or "
-                        "monitor that runs on the sensor itself needs an angle without jumps, too."
+                        f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped."
                     )
                 if signal.periodic and len(angle.unclear):
                     told += (
