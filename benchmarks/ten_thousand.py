@@ -3,13 +3,13 @@
     python benchmarks/ten_thousand.py [--periods 10000] [--only tanks] [--out FILE.json]
 
 Golf robot and disk are those of ``tests/golden`` with their trained networks. The others are priors with nominal
-parameters and small networks with random weights of several kinds; the tanks' sensor is bent. Each loop begins alike,
-tracks the machine's task over and over, and has a frozen sensor and an input that is off. C gets Python's samples and
-the inputs that acted there: without these it would be a controller whose input nobody applies, and one with integral
-action adds rounding up. "own" is the largest difference of the input, of its range, of C that goes on from its own
-plans after the first, "handed" that of C that goes on from Python's plan in each period; "state" and "reading" are
-those of the estimate and of the monitor in the first of the two. The script ends with an error where an alarm, a mode,
-a source or a status differs in any period.
+parameters and small networks with random weights of several kinds; the tanks' sensor is bent. One more loop tracks
+parameters and the share of its network. Each loop begins alike, tracks the machine's task over and over, and has a
+frozen sensor and an input that is off. C gets Python's samples and the inputs that acted there: without these it would
+be a controller whose input nobody applies, and one with integral action adds rounding up. "own" is the largest
+difference of the input, of its range, of C that goes on from its own plans after the first, "handed" that of C that
+goes on from Python's plan in each period; "state" and "reading" are those of the estimate and of the monitor in the
+first of the two. The script ends with an error where an alarm, a mode, a source or a status differs in any period.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import replay_parts as replays
 import torch
 from golden_parts import Parts, machine
 from replay_parts import Case, Whole, replay
-from test_networks import Cells, Deep
+from test_network_layers import Cells, Deep
 
 from hybrid_mpc import (
     OCP,
@@ -44,7 +44,9 @@ from hybrid_mpc import (
     load_scenario,
 )
 from hybrid_mpc.control.sizes import Sizes
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, with_tracked
 from hybrid_mpc.kit.assembly import make_estimator, make_ocp, make_resting_guard
+from hybrid_mpc.model.blend import BLEND_SHARE, blended, with_share
 from nn_export import to_casadi
 
 nn = torch.nn
@@ -67,6 +69,7 @@ class Machine:
     load: float = 0.02
     load_observer: bool = True
     learned: int = 300
+    tracked: tuple[TrackedParameter, ...] = ()  # and the share of the network's correction
 
 
 def sine(*columns):
@@ -156,7 +159,12 @@ def made(m: Machine, periods):
         prior = replace(prior, parameters=p)
     ocp = make_ocp(prior, kit.problem(m.task))
     model = with_network(prior, ocp, m.network)
+    if m.tracked:
+        model, prior = blended(prior, model), with_share(prior)
     estimator = make_estimator(model, kit, kit.noise("prior_observer"), ocp, observer=m.load_observer)
+    if m.tracked:
+        estimator = TrackingFilter(estimator, (*m.tracked, TrackedParameter(BLEND_SHARE.name, 0.3)))
+        model, prior = estimator.model, with_tracked(prior, estimator.tracked)
     safe = SafeController(CondensedController(model, ocp), prior, safe_input=kit.safe_input)
     plant = replays.MachinePlant(prior, sigma=m.sigma) if scenario.plant is None else scenario.plant()
     reference, x0, w = m.reference, model.x0, None
@@ -182,6 +190,12 @@ MACHINES = (
     Machine("emps", gru(), reference=sine((0.1, 2.0)), control=EMPS, sigma=1e-5, learned=1500),
     Machine(
         "xl330_pendulum", gru(), reference=sine((0.8, 2.0)), control=SERVO, learned=1500, load_observer=False
+    ),
+    Machine(
+        "temperature_lab",
+        gru(16),
+        "set_points",
+        tracked=(TrackedParameter("P1", 0.15, relative=True), TrackedParameter("tau", 0.2, relative=True)),
     ),
     Machine("torque_pendulum", gru(), reference=sine((0.25, 2.0))),
 )
@@ -209,7 +223,8 @@ def main() -> None:
         own = told["own"]
         rows.append(
             {
-                "machine": m.name, "periods": sum(t.periods for t in own), "with alarm": sum(t.alarms for t in own),
+                "machine": m.name + (", blended and tracked" if m.tracked else ""),
+                "periods": sum(t.periods for t in own), "with alarm": sum(t.alarms for t in own),
                 "modes": " ".join(dict.fromkeys(n for t in own for n in t.modes)),
                 "sources": " ".join(dict.fromkeys(n for t in own for n in t.sources)),
                 "own": max(t.input for t in own), "handed": max(t.input for t in told["handed"]),

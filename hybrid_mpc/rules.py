@@ -146,6 +146,17 @@ def two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
+def time_text(ms: float) -> str:
+    """A time [ms] with three significant digits: in seconds from one second on.
+
+    Example:
+        >>> time_text(2.13456), time_text(999.9), time_text(1e4), time_text(9e7)
+        ('2.13 ms', '1 s', '10 s', '90000 s')
+    """
+    rounded = float(f"{ms:.3g}")
+    return f"{rounded:g} ms" if rounded < 1e3 else f"{float(f'{rounded / 1e3:.3g}'):g} s"
+
+
 def markdown(text: str) -> str:
     """Any text for Markdown and cells of its tables: one line, special characters as numeric entities.
 

@@ -154,3 +154,24 @@ class PendulumPlant:
 
     def hidden(self, state):
         return np.zeros(0)
+
+
+def levitated_ball():
+    """A ball under a coil (textbook): gap, speed and current; the force has a pole beyond the declared range."""
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u")
+    xdot = ca.vertcat(
+        x[1], 1e3 * (9.81 - 70.0 * x[2] ** 2 / (x[0] + 6.0) ** 2 / 0.068), (u - 11.0 * x[2]) / 0.3
+    )
+    rates, x_next = ca.Function("rates", [x, u], [xdot]), x
+    for _ in range(8):  # the midpoint rule, 0.5 ms each
+        x_next = x_next + 5e-4 * rates(x_next + 2.5e-4 * rates(x_next, u), u)
+    states = (
+        Signal("gap", "mm", 0.0, 14.0),
+        Signal("speed", "mm/s", -400.0, 400.0),
+        Signal("current", "A", 0.0, 3.0),
+    )
+    current = float(np.sqrt(9.81 * 0.068 / 70.0) * 13.0)
+    return HybridModel.of(
+        "ball", 0.004, states, (Signal("voltage", "V", 0.0, 24.0),), (Signal("gap", "mm"),), x=x, u=u, x_next=x_next,
+        xdot=xdot, y=x[0], nominal_x=[7.0, 0.0, current], nominal_u=[11.0 * current],
+    )  # fmt: skip

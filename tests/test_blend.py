@@ -10,6 +10,7 @@ from online_models import make_filter, pendulum_model
 
 import hybrid_mpc as hm
 from hybrid_mpc.compare.loops import Bench, LoopSpec
+from hybrid_mpc.compare.study import Study
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
 from hybrid_mpc.kit.parts import loop_settings, save_loop
 from hybrid_mpc.model.blend import BLEND_SHARE, blended, with_share
@@ -85,9 +86,14 @@ def test_models_that_do_not_fit_are_refused():
 
 
 @pytest.fixture(scope="module")
-def kit(golf_artifact, tmp_path_factory):
-    folder = shutil.copytree(golf_artifact, tmp_path_factory.mktemp("blend") / "model")
-    save_loop(folder, loop_settings(hm.load_scenario("golf_robot"), NOISE))
+def folder(golf_artifact, tmp_path_factory):
+    place = shutil.copytree(golf_artifact, tmp_path_factory.mktemp("blend") / "model")
+    save_loop(place, loop_settings(hm.load_scenario("golf_robot"), NOISE))
+    return place
+
+
+@pytest.fixture(scope="module")
+def kit(folder):
     return hm.load(folder)
 
 
@@ -103,11 +109,49 @@ def test_a_kit_runs_prior_and_hybrid_side_by_side(kit):
     assert np.ptp(result.w) > 0.0
 
 
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
+def test_its_c_has_the_share(folder, tmp_path, call):
+    code, _, err = call(
+        "export", "c", folder, "--blended", "--no-monitor", "--check", "--out", tmp_path / "c"
+    )
+    assert code == 0, err
+    assert "`s.w`: correction_share" in (tmp_path / "c" / "README.md").read_text()
+
+
 def test_a_kit_that_recommends_the_prior_asks_for_a_start(kit):
     careful = replace(kit, recommended="prior")
     with pytest.raises(hm.InputError, match="HM-KIT-042"):
         careful.blended()
     assert careful.blended(0.5).models["hybrid"].p[-1] == 0.5
+
+
+def test_a_study_gives_the_blend_its_start(kit):
+    """Also where the prior is recommended; controllers without a blend have no share."""
+    study = Study(
+        "golf_robot",
+        "m",
+        ["track_step"],
+        ["prior_observer", "blended_observer"],
+        seeds=1,
+        duration=0.4,
+        share=0.5,
+    )
+    specs = {spec.controller: spec for spec in study.runs()}
+    assert {name: spec.share for name, spec in specs.items()} == {
+        "prior_observer": None,
+        "blended_observer": 0.5,
+    }
+    bench = Bench(hm.load_scenario("golf_robot"), {"model": replace(kit, recommended="prior")})
+    own = specs["blended_observer"]
+    assert bench.run(own)[1].w[0, 0] == 0.5
+    assert own.id != replace(own, share=None).id
+    with pytest.raises(hm.InputError, match="HM-KIT-042"):
+        bench.run(replace(own, share=None))
+    with pytest.raises(hm.InputError, match="HM-COMPARE-061"):
+        replace(study, controllers=("prior_observer",))
+    for share in (0.0, 2.0):
+        with pytest.raises(hm.InputError, match="HM-COMPARE-062"):
+            replace(study, share=share)
 
 
 @pytest.mark.parametrize("share", [0.0, 2.0, np.nan])

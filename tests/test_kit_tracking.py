@@ -1,6 +1,7 @@
-"""A kit that names tracked parameters: its files, its observer and controller in a loop, and what has no C."""
+"""A kit that names tracked parameters: its files, its observer and controller in a loop and as C."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -83,10 +84,26 @@ def test_the_window_of_a_moving_horizon_observer_has_the_tracked_parameters(kit)
     assert isinstance(kit.tracking_observer(kind="mhe").inner, hm.MovingHorizonEstimator)
 
 
-def test_c_refuses_an_observer_that_tracks(kit, tmp_path):
-    observer = kit.tracking_observer()
-    with pytest.raises(hm.InputError, match=r"TrackingFilter.*HM-EMBEDDED-011"):
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
+def test_its_c_tracks(kit, folder, tmp_path, call):
+    """By the command, without a monitor; in Python, with one and a guard."""
+    code, _, err = call("export", "c", folder, "--track", "--no-monitor", "--check", "--out", tmp_path / "c")
+    assert code == 0, err
+    assert "last entries of `s.w`: k" in (tmp_path / "c" / "README.md").read_text()
+    watched = replace(kit, watch={"prior": WatchFile({"residuals": LIMITS})})
+    place = hm.generate_controller(watched, tmp_path / "watched", tracking=True, guard="rest")
+    sizes = (place / "hmpc_config.h").read_text()
+    assert all(f"#define HMPC_{size}\n" in sizes for size in ("NW 2", "TRACKED 1", "LIMITS 2", "GUARD 1"))
+
+
+def test_what_has_no_c(kit, tmp_path):
+    observer = kit.tracking_observer(kind="mhe")
+    with pytest.raises(hm.InputError, match=r"MovingHorizonEstimator.*HM-EMBEDDED-011"):
         write_controller(tmp_path / "c", observer.model, OCP, estimator=observer)
+    with pytest.raises(hm.InputError, match="HM-KIT-043"):
+        hm.generate_controller(kit, tmp_path / "c", tracking=True, guard="adapt")
+    with pytest.raises(hm.InputError, match="HM-KIT-040"):
+        hm.generate_controller(kit.with_tracked(()), tmp_path / "c", tracking=True, monitor=False)
 
 
 @pytest.mark.parametrize("w", [[5e-5], [5e-5, np.nan], [[5e-5], [5e-5]]])

@@ -370,8 +370,8 @@ def _in_loop(draft: Draft) -> Draft:
     loop = ""
     if answered > CLOSED:
         loop = f"inputs react to outputs, {answered:.1f} times more than by chance"
-    elif draft.set_points:
-        loop = "set-points are recorded"
+    elif any(draft.verdicts[c.full].sure for c in draft.set_points):  # unsure: no column follows it
+        loop = "a column follows a set-point"
     growth = growth_of(runs, draft.period) if loop else 0.0
     return replace(draft, loop=loop, growth=growth)
 

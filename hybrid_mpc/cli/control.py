@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybrid_mpc.cli.options import ScenarioName
-from hybrid_mpc.rules import MOST_SEED
+from hybrid_mpc.rules import MOST_SEED, time_text
 
 if TYPE_CHECKING:
     from hybrid_mpc.compare.loops import LoopRow
@@ -60,6 +60,13 @@ def control(
             help="As --guard, with a backup model that adapts mass and friction (the scenario's causes).",
         ),
     ] = False,
+    share: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of the network's correction that blended_observer starts with, between 0 and 2. Default: 1, if "
+            "the hybrid is recommended."
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the loops in an existing folder.")] = False,
     gif: Annotated[bool, typer.Option("--gif/--no-gif", help="Draw animations.")] = True,
 ) -> None:
@@ -77,7 +84,7 @@ def control(
     study = Study(
         scenario, model, tuple(task or ()), tuple(dict.fromkeys(controllers)), (solver,),
         monitors=("guard" if guarded else "own",), faults=(" + ".join(fault or ()),), seeds=seeds, run_seed=seed,
-        guard="adapt" if adapt else "rest" if guard else "",
+        guard="adapt" if adapt else "rest" if guard else "", share=share,
     )  # fmt: skip
     with make_progress() as progress:
         results = run_control(study, out, progress, gif=gif, resume=resume)
@@ -106,8 +113,8 @@ def summary(results: ControlResults) -> list[str]:
     lines += [line for row in results.loops if results.reaction for line in _guarded(row)]
     for name, times in results.step_ms.items():
         lines.append(
-            f"step time of {name}: median {times['median']:.2f} ms, 99 % within {times['p99']:.2f} ms, period "
-            f"{results.period_ms:g} ms"
+            f"step time of {name}: median {time_text(times['median'])}, 99 % within {time_text(times['p99'])}, period "
+            f"{time_text(results.period_ms)}"
         )
     return lines
 

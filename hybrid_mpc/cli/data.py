@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.rules import MOST_SEED, counted, markdown, printable
+from hybrid_mpc.rules import MOST_SEED, counted, markdown, printable, time_text
 
 if TYPE_CHECKING:
     from hybrid_mpc.scenario import Scenario
@@ -140,13 +140,13 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
             for column, s in signals
         ),
         "",
-        f"Sampling: {1e3 * period:.3g} ms, uniform; numpy arrays by these names."
+        f"Sampling: {time_text(1e3 * period)}, uniform; numpy arrays by these names."
         if arrays
-        else f"Sampling: {1e3 * period:.3g} ms; the recorded time stamps jitter by {1e3 * spread:.2g} ms "
+        else f"Sampling: {time_text(1e3 * period)}; the recorded time stamps jitter by {time_text(1e3 * spread)} "
         "(one standard deviation). Commas separate cells, points mark decimals, the first row is the header.",
         "",
         f"'hybrid-mpc run' smooths and differentiates the outputs by a local quartic over "
-        f"{spec.smoothing:g} s (-3 dB at {band:.1f} Hz) and resamples them to {1e3 * spec.dt:g} ms.",
+        f"{spec.smoothing:g} s (-3 dB at {band:.1f} Hz) and resamples them to {time_text(1e3 * spec.dt)}.",
         "", "| file | role |", "| --- | --- |",
         *(f"| {markdown(path.name)} | {_role(scenario, path)} |" for path in files), "",
     ]  # fmt: skip

@@ -66,12 +66,19 @@ def explain(
 
 def summary(found: ExplainResult, folder: Path) -> list[str]:
     """The result in a few lines."""
+    from hybrid_mpc.workflow.explain_page import ALONE
+
     explanation = found.explanation
     lines = [f"evaluated on {explanation.evidence.text}, in free runs of {explanation.evidence.length:.3g} s"]
+    if explanation.evidence.recordings == 1:
+        lines.append(ALONE)
     if explanation.steps:
         lines.append(f"errors: all samples together; ratios: {explanation.averaged}")
     if not explanation.found:
-        return [*lines, f"no term was added: {explanation.reason}"]
+        return [
+            *lines, f"no term was added: {explanation.reason}",
+            "no scenario file was written: the prior stays as it is",
+        ]  # fmt: skip
     lines += [f"found: {term.name}: {term.formula}" for term in explanation.found]
     return [
         *lines,
@@ -82,7 +89,7 @@ def summary(found: ExplainResult, folder: Path) -> list[str]:
 
 def _steps(found: ExplainResult) -> Table:
     """One row per step."""
-    from hybrid_mpc.workflow.explain_page import RATIO, alternatives_of, interval, signed, values_of
+    from hybrid_mpc.workflow.explain_page import RATIO, alternatives_of, signed, values_of
 
     explanation = found.explanation
     table = _table("steps", "step", "held-out error [-]", RATIO, "fitted values", "alternatives")
@@ -90,7 +97,7 @@ def _steps(found: ExplainResult) -> Table:
     table.add_row("prior, fitted", f"{explanation.before:.3g}", "", "", "")
     for step in explanation.steps:
         table.add_row(
-            signed(step), f"{step.held_out.error:.3g}", interval(step), values_of(step), alternatives_of(step)
+            signed(step), f"{step.held_out.error:.3g}", step.held_out.words, values_of(step), alternatives_of(step)
         )  # fmt: skip
     return table
 

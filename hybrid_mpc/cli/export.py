@@ -13,7 +13,8 @@ EXAMPLES = (
     "Examples:\n\n"
     "  hybrid-mpc export c runs/golf --out controller\n\n"
     "  hybrid-mpc export c runs/golf --task track --float --out controller\n\n"
-    "  hybrid-mpc export c runs/golf --guard --check --out controller"
+    "  hybrid-mpc export c runs/golf --guard --check --out controller\n\n"
+    "  hybrid-mpc export c runs/tanks --track --out controller"
 )
 
 app = typer.Typer(help="Write a trained controller as C.", no_args_is_help=True, rich_markup_mode=None)
@@ -42,6 +43,15 @@ def c(
             "--adapt", help="As --guard, with a second controller that adapts to the changed machine."
         ),
     ] = False,
+    track: Annotated[
+        bool, typer.Option("--track", help="Track the parameters that a run with --track found.")
+    ] = False,
+    blended: Annotated[
+        bool,
+        typer.Option(
+            "--blended", help="As --track, and run prior and hybrid side by side with an estimated share."
+        ),
+    ] = False,
     check: Annotated[
         bool,
         typer.Option(
@@ -56,8 +66,10 @@ def c(
 
     check_folder(out)
     reaction = "adapt" if adapt else "rest" if guard else ""
+    kit = load(model)
     folder = generate_controller(
-        load(model), out, model=name, task=task, single=single, monitor=monitor, guard=reaction, check=check
-    )
+        kit.blended() if blended else kit, out, model=name, task=task, tracking=track or blended, single=single,
+        monitor=monitor, guard=reaction, check=check,
+    )  # fmt: skip
     said = "compiled and tested; README.md has the sizes" if check else "not compiled or run"
     print(f"C in {folder.resolve()}; {said}. Next: make -C {shlex.quote(str(folder))} test")

@@ -164,7 +164,8 @@ def track_lines(results: Results) -> list[str]:
     ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in found.tracking.ratio.items())
     return [
         f"tracked parameters, with their standard deviations: {names}; errors of predictions over those without "
-        f"tracking: {ratios}"
+        f"tracking: {ratios}",
+        *found.tracking.doubts,
     ]
 
 

@@ -81,16 +81,18 @@ def noise_name(controller: str) -> str:
 
 
 def build(
-    name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti"
+    name: str, scenario: Scenario, kit: Kit, control: OCP, *, solver: str = "rti", share: float | None = None
 ) -> tuple[Estimator, SafeController]:
     """Build estimator and controller by name for a task's control problem; oracles have a solver of their own.
+
+    ``share`` is the share of the network's correction that a blend starts with (:meth:`Kit.blended`).
 
     Raises:
         InputError: If the controller is unknown, the scenario has no oracle, or the kit has no noise.
     """
     c, prior = CONTROLLERS[known(name, CONTROLLERS, "controller")], kit.models["prior"]
     if not c.compared:
-        own = kit.blended() if c.blended else kit
+        own = kit.blended(share) if c.blended else kit
         own = replace(own, loop=replace(own.loop, control={"": control}))
         return own.tracking_observer(c.model), own.controller(c.model, solver=solver, tracking=True)
     if c.model != "oracle":

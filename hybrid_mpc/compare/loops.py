@@ -88,6 +88,8 @@ class LoopSpec:
         guard: Name in :data:`GUARDS`; it needs a monitor that alarms. Default: none.
         run_seed: Seed of the run that the loop belongs to. Default: 0.
         rounds: Factors of the reference, one a round of the repeated task. Default: a single round.
+        share: Share of the network's correction that ``blended_observer`` starts with. Default: that of
+            :meth:`~hybrid_mpc.kit.artifact.Kit.blended`.
         keep: Arrays of its row, names in :data:`ARRAYS`: fields of
             :class:`~hybrid_mpc.loop.simulate.ClosedLoopResult`, ``"step_ms"`` ``(n,)``, ``"plans"``
             ``(n, N + 1, n_x)``. Not part of the identity. Default: none.
@@ -119,6 +121,7 @@ class LoopSpec:
     guard: str = ""
     run_seed: int = 0
     rounds: tuple[float, ...] = ()
+    share: float | None = None
     keep: tuple[str, ...] = field(default=(), compare=False)
     number: int = field(default=0, compare=False)
 
@@ -157,7 +160,8 @@ class LoopSpec:
     @cached_property
     def id(self) -> str:
         """The first 20 hexadecimal digits of the SHA-256 of the specification's JSON form."""
-        return digest({k: v for k, v in asdict(self).items() if k not in ("number", "keep")})[:20]
+        left_out = ("number", "keep", *(("share",) if self.share is None else ()))
+        return digest({k: v for k, v in asdict(self).items() if k not in left_out})[:20]
 
     @property
     def noise_seed(self) -> int:
@@ -358,10 +362,17 @@ class Bench:
     def parts(self, spec: LoopSpec) -> tuple[Estimator, SafeController]:
         """Estimator and controller of a specification; they have no memory, so many loops can share them."""
         kit = self.kit(spec)
-        key = (spec.model, spec.controller, spec.solver, spec.horizon, self._find_own_problem(spec))
+        key = (
+            spec.model,
+            spec.controller,
+            spec.solver,
+            spec.horizon,
+            spec.share,
+            self._find_own_problem(spec),
+        )
         if key not in self._built:
             self._built[key] = build(
-                spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver
+                spec.controller, self.scenario, kit, self.problem(spec), solver=spec.solver, share=spec.share
             )
             if len(self._built) > MOST_BUILT:
                 self._built.popitem(last=False)

@@ -33,7 +33,7 @@ from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.equilibrium import equilibrium_input, hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
-from hybrid_mpc.rules import counted
+from hybrid_mpc.rules import counted, time_text
 from hybrid_mpc.scenario import Task
 
 Array = NDArray[np.float64]
@@ -591,8 +591,8 @@ def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
     ms = np.sort(np.concatenate([one.result.timing_ms["total"] for one in trials]))
     p99, worst = float(np.quantile(ms, 0.99)), float(ms[-1])
     evidence = (
-        f"99 % of {ms.size} steps take less than {p99:.3g} ms of processor time, the longest {worst:.3g} ms; the "
-        f"period is {period_ms:.4g} ms"
+        f"99 % of {ms.size} steps take less than {time_text(p99)} of processor time, the longest {time_text(worst)}; "
+        f"the period is {time_text(period_ms)}"
     )
     remedy = (
         "Use solver native (compiled C), a shorter horizon, move blocks or a longer dt (docs/choosing.md)."

@@ -23,6 +23,7 @@ from hybrid_mpc.errors import InputError, named_extra
 from hybrid_mpc.files import read_bytes
 from hybrid_mpc.kit.assembly import SOLVERS
 from hybrid_mpc.loop.faults import SIGNAL_TARGETS, Fault, parsed_fault
+from hybrid_mpc.model.blend import BLEND_SHARE
 from hybrid_mpc.records import Fields, known, plain, record
 from hybrid_mpc.rules import MOST_SEED, Duration, Label, Name, NameOrNone, Number, Seconds, name_problem
 from hybrid_mpc.scenario import load_scenario, registered_scenarios, scenario_of
@@ -205,6 +206,8 @@ class Study:
             hybrids. Default: none.
         run_seed: Seed of the run; 1000 times it is added to the seeds of the loops, as in a run. Default: 0.
         name: Name in tables and the report. Default: study.
+        share: Share of the network's correction that the controller ``blended_observer`` starts with, between 0 and 2.
+            Default: 1, if the hybrid is recommended; a model that recommends the prior needs a share.
 
     Raises:
         InputError: If a name is unknown (the message names the nearest one), or a number or combination is invalid.
@@ -237,6 +240,7 @@ oracle, oracle_state
     guard: str = ""
     run_seed: int = 0
     name: Label = "study"
+    share: Number | None = None
 
     def __post_init__(self) -> None:
         for field, value in _unify_fields(self).items():
@@ -320,6 +324,7 @@ oracle, oracle_state
                         duration=self.duration,
                         guard=self.guard,
                         run_seed=self.run_seed,
+                        share=self.share if CONTROLLERS[controller].blended else None,
                         number=next(number),
                     )
 
@@ -357,6 +362,15 @@ oracle, oracle_state
                 )
 
     def _check_combinations(self) -> None:
+        if self.share is not None and not any(CONTROLLERS[name].blended for name in self.controllers):
+            raise InputError(
+                "study: share belongs to controller blended_observer, which is not listed. Add this controller, or "
+                "remove share [HM-COMPARE-061]"
+            )
+        if self.share is not None and not 0.0 < self.share < BLEND_SHARE.upper:
+            raise InputError(
+                f"study: share must be between 0 and {BLEND_SHARE.upper:g}, got {self.share} [HM-COMPARE-062]"
+            )
         oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and set(self.solvers) != {"rti"}:
             raise InputError(

@@ -30,6 +30,8 @@ KEPT = 1e-7
 """Violation, over its size, up to which a hard bound counts as kept: the tolerance of the solvers."""
 BEYOND = 10.0
 """Widths of a state's declared range that a plan may lie outside of it: further out the model's prediction diverges."""
+USABLE = 0.5
+"""Widths beyond its declared range in which a state of a free run may be: there the first linearization still holds."""
 KNOTS = 8
 """Most set-points of one preview with a steady state of their own. For a reference that changes all the time, steady
 states are interpolated between so many rows."""
@@ -622,9 +624,11 @@ class Problem:
         """Input ``(n_u,)`` of the operating point, within the limits."""
         limits = [(-np.inf, np.inf) if s.periodic else (s.lower, s.upper) for s in model.states]
         lower, upper = np.array(limits).reshape(-1, 2).T
-        width = BEYOND * (upper - lower)
-        self.reach: tuple[Array, Array] = lower - width, upper + width
+        width = upper - lower
+        self.reach: tuple[Array, Array] = lower - BEYOND * width, upper + BEYOND * width
         """Bounds ``(n_x,)`` beyond which a plan diverges; infinite for periodic states and open ranges."""
+        self.usable: tuple[Array, Array] = lower - USABLE * width, upper + USABLE * width
+        """Bounds ``(n_x,)`` within which a free run is a first plan, likewise."""
 
     def diverges(self, x: Array) -> bool:
         """True if states ``(n, n_x)`` lie further outside of their declared ranges than :data:`BEYOND` widths."""
@@ -635,13 +639,15 @@ class Problem:
         """A first plan, of status INITIAL: a free run of the model from the estimate with ``u`` ``(N, n_u)``.
 
         ``u[0]`` is the input held before the next solve; without ``u`` it is the operating point's. If the free run
-        diverges, the state is held at the estimate.
+        leaves the declared ranges by more than :data:`USABLE` widths, the state is held at the estimate: a free run of
+        an unstable machine soon is where the model means nothing.
         """
         n, ocp = self.ocp.horizon, self.ocp
         start = np.tile(self.u_rest, (n, 1)) if u is None else input_plan(u, n, ocp.n_u, "u")
         plan, w = np.clip(start, ocp.u_min, ocp.u_max), self.forecast(None, estimate)
         z = self.run(np.concatenate([estimate.x, estimate.h]), self.model.acting(plan, estimate.d, w))
-        if not np.all(np.isfinite(z)):
+        low, high = self.usable
+        if not (np.isfinite(z).all() and ((z[:, : ocp.n_x] >= low) & (z[:, : ocp.n_x] <= high)).all()):
             z = np.tile(z[0], (n + 1, 1))
         x, h = z[:, : ocp.n_x], z[:, ocp.n_x :]
         nan = float("nan")

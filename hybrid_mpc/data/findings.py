@@ -158,9 +158,7 @@ class Channel:
                     f"for {signal.name} in the prior to unwrap it, or record an angle without jumps."
                 )
                 if signal.periodic:
-                    told = (
-                        f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped."
-                    )
+                    told = f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped."
                 if signal.periodic and len(angle.unclear):
                     told += (
                         f" Before {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} s) too many samples "

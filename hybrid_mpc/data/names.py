@@ -217,10 +217,11 @@ ENDINGS = {  # units by the last words of a name, in small letters
     "degs": "deg/s", "m s": "m/s", "mm s": "mm/s", "cm s": "cm/s", "km h": "km/h", "rad s2": "rad/s^2",
     "deg s2": "deg/s^2", "m s2": "m/s^2", "l min": "l/min", "l s": "l/s", "l h": "l/h", "ml min": "ml/min",
     "m3 h": "m^3/h", "m3 s": "m^3/s", "kg h": "kg/h", "kg s": "kg/s", "kg min": "kg/min", "g s": "g/s",
-    "mol l": "mol/l", "w m2": "W/m^2",
+    "mol l": "mol/l", "w m2": "W/m^2", "knot": "kn", "knots": "kn", "kts": "kn", "mph": "mph", "dps": "deg/s",
+    "rps": "rps",
 }  # fmt: skip
-LETTERS = {"K": "K", "V": "V", "A": "A", "N": "N", "W": "W", "m": "m"}
-"""Units of a single letter, as written; the letter may also be an index."""
+LETTERS = {"K": "K", "V": "V", "A": "A", "N": "N", "W": "W", "m": "m", "kn": "kn", "kN": "kN"}
+"""Units as written; a single letter may also be an index."""
 
 
 class Ending(NamedTuple):
@@ -264,7 +265,7 @@ def _parted(name: str) -> tuple[list[str], Ending]:
             if len(words) > count and (unit := ENDINGS.get(" ".join(words[-count:]).casefold())):
                 return _written(" ".join(words[:-count]), camel=True), Ending(unit)
         if len(words) > 1 and words[-1] in LETTERS:
-            return _written(" ".join(words[:-1]), camel=True), Ending(LETTERS[words[-1]], True)
+            return _written(" ".join(words[:-1]), camel=True), Ending(LETTERS[words[-1]], len(words[-1]) == 1)
     return words, Ending()
 
 

@@ -22,6 +22,7 @@ from hybrid_mpc.embedded.generate import (
     HEADERS,
     SOURCES,
     Sources,
+    filters_of,
     make_sources,
     sources_of,
     template,
@@ -30,6 +31,7 @@ from hybrid_mpc.embedded.scalar import table
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.estimate.switching import Filter
+from hybrid_mpc.estimate.tracking import TrackingFilter, tracked_range
 from hybrid_mpc.files import replacing_folder, write_text
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model.model import HybridModel
@@ -42,6 +44,9 @@ VECTORS = 25
 TOLERANCE = {False: 1e-9, True: 1e-3}
 """Tolerance of the test, double and single precision: inputs over their range, states over their size. In single
 precision (seven digits) the QP limits the accuracy."""
+ROUNDED = 100.0
+"""Deviations of C from Python that count as rounding, over those by one rounding error of the samples: a step adds up
+hundreds of numbers, in C in another order."""
 OTHERS = ("hmpc_test.c", "Makefile", "CMakeLists.txt")
 MONITOR_README = """\
 `hmpc_finish` runs the monitor on @WATCHED@. `s.monitor.alarm` is 1 during an alarm; the other fields of `s.monitor`
@@ -76,7 +81,7 @@ class Footprint:
 
 
 def write_controller(
-    folder: Path, model: HybridModel, ocp: OCP, *, estimator: Filter | None = None,
+    folder: Path, model: HybridModel, ocp: OCP, *, estimator: Filter | TrackingFilter | None = None,
     fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
     monitor: Monitor | None = None, guard: Guard | None = None, check: bool = False,
 ) -> Sources:  # fmt: skip
@@ -97,17 +102,19 @@ def write_controller(
     texts = {name: template(name) for name in (*HEADERS, *SOURCES, *OTHERS)} | dict(found.texts)
     for name in ("Makefile", "CMakeLists.txt"):
         texts[name] = texts[name].replace("@SOURCES@", " ".join(sources_of(found)))
-    texts["hmpc_vectors.h"] = _vectors(safe, estimator, single, monitor)
+    tolerance, texts["hmpc_vectors.h"] = _vectors(safe, estimator, single, monitor)
     with replacing_folder(folder) as new:
         for name, text in texts.items():
             write_text(new / name, text)
         sizes = checked(new, sources_of(found)) if check else None
-        write_text(new / "README.md", _readme(model, found, sizes, single))
+        write_text(new / "README.md", _readme(model, found, sizes, single, tolerance))
     return found
 
 
-def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monitor: Monitor | None) -> str:
-    """Test vectors: a short loop on the model itself, from the operating point towards a set-point near it."""
+def _vectors(
+    safe: SafeController, estimator: Filter | TrackingFilter | None, single: bool, monitor: Monitor | None
+) -> tuple[float, str]:
+    """Tolerance and vectors of the test: a short loop on the model itself, from the operating point to one near it."""
     model, ocp = safe.controller.model, safe.controller.ocp
     size = safe.controller.problem.sizes.states
     tolerated = (
@@ -117,28 +124,26 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monit
     goal[: tolerated.size] += tolerated
     rng = np.random.default_rng(0)
     z, n_x = np.concatenate([model.x0, np.zeros(model.n_h)]), model.n_x
-    sigma = np.zeros(model.n_y) if estimator is None else np.sqrt(_noise(estimator))
+    sigma = np.zeros(model.n_y) if estimator is None else np.sqrt(filters_of(estimator)[0].noise[1])
+    acting = model.w
+    if isinstance(estimator, TrackingFilter):  # a machine whose parameters are a standard deviation off
+        acting = np.append(acting[: -len(estimator.tracked)], tracked_range(model, estimator.tracked, 1.0)[1])
     estimate: Estimate | None = None
     decision, rows, readings = None, [], []
     memory: Any = None if monitor is None else monitor.initial()
     for _ in range(VECTORS):
         u = safe.controller.problem.u_rest if decision is None else decision.u
-        y = model.output(z[:n_x], u, model.w, model.p).full().ravel() + sigma * rng.standard_normal(model.n_y)
-        if estimator is None:
-            empty = np.zeros(model.n_d)
-            estimate = Estimate(0.0, z[:n_x], z[n_x:], empty, np.zeros((0, 0)), y, 0.0, w=model.w)
-        elif estimate is None:
-            estimate = estimator.start(y, w=model.w)
-        else:
-            estimate = estimator.update(estimate, y, u, w=model.w)
+        y = model.output(z[:n_x], u, acting, model.p).full().ravel() + sigma * rng.standard_normal(model.n_y)
+        estimate = _estimated(model, estimator, estimate, z, y, u)
         if monitor is not None:
             memory, reading = monitor.update(memory, y, u, estimate)
             readings.append(_numbers(reading))
         decision = safe.initial(estimate) if decision is None else decision
         decision = safe.decide(decision, estimate, goal[None])
         rows.append((y, model.w, estimate.x, estimate.h, decision.u))
-        step = model.step(z[:n_x], z[n_x:], decision.u, model.w, model.p)
+        step = model.step(z[:n_x], z[n_x:], decision.u, acting, model.p)
         z = np.concatenate([v.full().ravel() for v in step])
+    rounding = _rounding(safe, estimator, rows, goal)
     columns = zip("ywxhu", (np.array(c) for c in zip(*rows, strict=True)), strict=True)
     tables = [table(f"vector_{name}", values) for name, values in columns]
     tables += [table("vector_goal", goal[None]), table("vector_x_size", size)]
@@ -148,21 +153,51 @@ def _vectors(safe: SafeController, estimator: Filter | None, single: bool, monit
         largest = np.max(np.nan_to_num(np.abs(found)), axis=0)
         tables.append(table("vector_reading", found))
         tables.append(table("vector_reading_size", np.where(largest > 0, largest, 1.0)))
-    head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({TOLERANCE[single]!r})\n"
-    return (
-        "/* Decisions of the Python controller in a short loop, generated. */\n"
-        f"#ifndef HMPC_VECTORS_H\n#define HMPC_VECTORS_H\n{head}{''.join(tables)}#endif\n"
-    )
+    tolerance = max(TOLERANCE[single], ROUNDED * rounding)
+    head = f"#define VECTORS {VECTORS}\n#define VECTOR_TOLERANCE R({tolerance!r})\n"
+    text = "/* Decisions of the Python controller in a short loop, generated. */\n"
+    return tolerance, f"{text}#ifndef HMPC_VECTORS_H\n#define HMPC_VECTORS_H\n{head}{''.join(tables)}#endif\n"
+
+
+def _estimated(
+    model: HybridModel, estimator: Filter | TrackingFilter | None, before: Estimate | None, z: Array, y: Array,
+    u: Array,
+) -> Estimate:  # fmt: skip
+    """Estimate after a sample ``y``; without an estimator that of the states and hidden states ``z``."""
+    if estimator is None:
+        none = np.zeros((0, 0))
+        return Estimate(0.0, z[: model.n_x], z[model.n_x :], np.zeros(model.n_d), none, y, 0.0, w=model.w)
+    if before is None:
+        return estimator.start(y, w=model.w)
+    return estimator.update(before, y, u, w=model.w)
+
+
+def _rounding(
+    safe: SafeController,
+    estimator: Filter | TrackingFilter | None,
+    rows: Sequence[tuple[Array, ...]],
+    goal: Array,
+) -> float:
+    """Largest change of an input, over its range, if every sample changes by a rounding error.
+
+    Plans of an unstable machine depend on their start exponentially, and so does what rounding makes of them.
+    """
+    model, rng = safe.controller.model, np.random.default_rng(1)
+    eps, estimate, decision, largest = float(np.finfo(float).eps), None, None, 0.0
+    for y, _, x, h, want in rows:
+        u = safe.controller.problem.u_rest if decision is None else decision.u
+        z = np.concatenate([x, h])
+        z, y = (v * (1.0 + eps * rng.choice([-1.0, 1.0], v.size)) for v in (z, y))
+        estimate = _estimated(model, estimator, estimate, z, y, u)
+        decision = safe.initial(estimate) if decision is None else decision
+        decision = safe.decide(decision, estimate, goal[None])
+        largest = max(largest, float(np.max(np.abs(decision.u - want) / safe.controller.ocp.input_range)))
+    return largest
 
 
 def _numbers(reading: Reading) -> Array:
     """Numbers of a monitor's reading that the test program compares: alarm, and the channels' values."""
     return np.array([float(reading.alarm), *reading.values])
-
-
-def _noise(estimator: Filter) -> Array:
-    first = estimator.filters[0] if hasattr(estimator, "filters") else estimator
-    return first.noise[1]
 
 
 def checked(folder: Path, names: Sequence[str] = SOURCES) -> Footprint:
@@ -220,6 +255,14 @@ def _watching(n: Mapping[str, int], code: Mapping[str, int], step: int) -> int:
     )
 
 
+def _estimator_readme(model: HybridModel, sizes: Mapping[str, int]) -> str:
+    if not sizes["MODES"]:
+        return "none, the caller passes an estimate"
+    tracked = [markdown(s.name) for s in model.disturbances[model.n_w - sizes["TRACKED"] :]]
+    values = f"; tracked parameters, the last entries of `s.w`: {', '.join(tracked)}" if tracked else ""
+    return f"{sizes['MODES']} parallel Kalman filters{values}"
+
+
 def _monitor_readme(sizes: Mapping[str, int]) -> str:
     if not sizes["MONITOR"]:
         return "There is no monitor: the controller was generated without one.\n\n"
@@ -235,24 +278,23 @@ def operations(found: Sources) -> dict[str, int]:
     n, code = found.sizes, found.operations
     n_z, n_v, units = n["NX"] + n["NH"], n["BLOCKS"] * n["NU"], n["UNITS"]
     padded = -(-n_z // 8) * 8
+    width = padded + n["NU"] + n["TRACKED"]
     active = np.minimum(np.arange(1, n["N"]) * n["NU"], n_v)
     stage = (
         code.get("model_before_slope", 0)
         + code["model_after_slope"]
         + units * (6 * (n.get("FEATURES", 0) + units) + 110)
     )
-    stage += units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) + 2 * n["HEAD"] * units * (padded + n["NU"])
+    stage += units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) + 2 * n["HEAD"] * units * width
     of_layers = [
         count for name, count in code.items() if name.startswith("layers") and not name.endswith("_seen")
     ]
-    stage += sum(of_layers) + 2 * n["PASSED"] * (n_z + n["NU"])
-    n_e = n_z + n["ND"]
+    stage += sum(of_layers) + 2 * n["PASSED"] * width
+    n_e = n_z + n["TRACKED"] + n["ND"]
     n_t = n_z + n["NU"]
     newton = 2 * n_z**2 * n_t + 4 * n_z * n_t * n["NU"] + 2 * n["NH"] ** 3 // 3
     search = {"step: steady state, one iteration": stage + newton} if n["OUTPUT_COST"] else {}
-    step_only = (
-        stage - units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) - 2 * n["HEAD"] * units * (padded + n["NU"])
-    )
+    step_only = stage - units * (5 * units + 8 * n.get("SEEN_SLOPES", 0)) - 2 * n["HEAD"] * units * width
     watch = {"finish: monitor, at most": _watching(n, code, step_only)} if n["MONITOR"] else {}
     return (
         search
@@ -268,7 +310,9 @@ def operations(found: Sources) -> dict[str, int]:
     )
 
 
-def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single: bool) -> str:
+def _readme(
+    model: HybridModel, found: Sources, sizes: Footprint | None, single: bool, tolerance: float
+) -> str:
     n = found.sizes
     rows = "".join(f"| {name} | {count:,} |\n" for name, count in operations(found).items())
     if sizes is None:
@@ -283,9 +327,9 @@ def _readme(model: HybridModel, found: Sources, sizes: Footprint | None, single:
     values: Mapping[str, object] = {
         "NAME": markdown(model.name), "KIND": "float" if single else "double", "MEMORY": memory, "OPERATIONS": rows,
         "SIZES": f"{n['NX']} states, {n['NH']} hidden states, {n['NU']} inputs, {n['NY']} outputs, horizon {n['N']}",
-        "DT": model.dt, "TOLERANCE": TOLERANCE[single],
+        "DT": model.dt, "TOLERANCE": f"{tolerance:.2g}",
         "MONITOR": _monitor_readme(n), "TARGETS": TARGETS_README if n["OUTPUT_COST"] else "",
-        "ESTIMATOR": f"{n['MODES']} parallel Kalman filters" if n["MODES"] else "none, the caller passes an estimate",
+        "ESTIMATOR": _estimator_readme(model, n),
         "FILES": ", ".join(f"`{name}`" for name in GENERATED),
     }  # fmt: skip
     return re.sub("@([A-Z]+)@", lambda found: str(values[found[1]]), template("README.md"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import cast
@@ -31,6 +31,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate import kalman
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import NEGLIGIBLE, Filter, SwitchingFilter
+from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, tracked_values
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.model import equilibrium
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
@@ -78,9 +79,9 @@ class Sources:
 
 
 def make_sources(
-    model: HybridModel, ocp: OCP, *, estimator: Filter | None = None, fallback: HybridModel | None = None,
-    safe_input: Array | None = None, single: bool = False, monitor: Monitor | None = None, guard: Guard | None = None,
-    max_age: int = MAX_AGE,
+    model: HybridModel, ocp: OCP, *, estimator: Filter | TrackingFilter | None = None,
+    fallback: HybridModel | None = None, safe_input: Array | None = None, single: bool = False,
+    monitor: Monitor | None = None, guard: Guard | None = None, max_age: int = MAX_AGE,
 ) -> Sources:  # fmt: skip
     """Generate the files of a controller; with a guard's backup, also all files of the backup.
 
@@ -98,7 +99,10 @@ def make_sources(
     Raises:
         InputError: If a part cannot be exported as C; lists all such parts together.
     """
-    refused = _refused(ocp, estimator, single)
+    own, tracked = (
+        (estimator.inner, estimator.tracked) if isinstance(estimator, TrackingFilter) else (estimator, ())
+    )
+    refused = _refused(model, ocp, own, tracked, single)
     parts: Cut | None = None
     try:
         parts = cut(model)
@@ -128,13 +132,14 @@ def make_sources(
     problem = Problem(model, ocp)
     soft = problem.soft
     expressions = sum(int(f.numel_out(0)) for f in soft.functions)
-    modes = () if estimator is None else _modes(estimator)
+    modes = () if own is None else filters_of(own)
     starts, aims = ocp.block_starts, target_starts(problem.targets)
     curved, cost = _curved(model), problem.economic
     staged = cost.function is not None and (ocp.economic is not None or curved)
     sizes = {
         "NX": model.n_x, "NH": model.n_h, "NU": model.n_u, "NY": model.n_y, "NW": model.n_w, "ND": model.n_d,
-        "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": soft.states.size, "SOFT_E": expressions, "MODES": len(modes),
+        "TRACKED": len(tracked), "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": soft.states.size,
+        "SOFT_E": expressions, "MODES": len(modes),
         "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": max_age, "FIRST": FIRST,
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
         "NP": ocp.n_p, "HARD": int(np.any(soft.hard)), "OUTPUT_COST": int(ocp.n_y > 0), "TARGET_KNOTS": KNOTS,
@@ -148,12 +153,12 @@ def make_sources(
         "TURNS": int(estimator is not None and any(s.periodic for s in (*model.outputs, *model.disturbances))),
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
-        model, parts, soft, fallback, ocp, problem, sizes, watched.code
+        model, parts, soft, fallback, ocp, problem, sizes, watched.code, tracked
     )
     guard_sizes, guard_tables = guard_parts(guard, model)
     sizes |= {**model_sizes, **watched.sizes, **guard_sizes}
     tables = _tables(
-        model, ocp, problem, soft, fallback, safe_input, estimator, watched.tables + guard_tables
+        model, ocp, problem, soft, fallback, safe_input, own, tracked, watched.tables + guard_tables
     )
     config = _config(sizes, single, bound_names(soft, ocp.horizon), watched)
     texts = {"hmpc_config.h": config, "hmpc_tables.h": tables, "hmpc_expressions.h": code}
@@ -186,9 +191,16 @@ def sources_of(found: Sources) -> tuple[str, ...]:
     return (*SOURCES, *(_rename(name) for name in CORE if found.sizes["BACKUP"]))
 
 
-def _refused(ocp: OCP, estimator: object, single: bool) -> list[str]:
+def _refused(
+    model: HybridModel, ocp: OCP, estimator: object, tracked: Sequence[TrackedParameter], single: bool
+) -> list[str]:
     """Texts about the parts of a control problem and an observer that cannot be exported as C."""
-    found = []
+    found, names = [], [one.name for one in tracked]
+    if [s.name for s in model.disturbances[max(0, model.n_w - len(names)) :]] != names:
+        found.append(
+            f"an observer that tracks {', '.join(names)} beside a controller that does not; give the controller the "
+            "observer's model (tracking=True)"
+        )
     if type(estimator) not in (ExtendedKalmanFilter, SwitchingFilter, type(None)):
         found.append(
             f"an estimator of this kind ({type(estimator).__name__}); needed: an ExtendedKalmanFilter or a "
@@ -209,8 +221,10 @@ def _curved(model: HybridModel) -> bool:
     return bool(ca.depends_on(ca.jacobian(y, ca.vertcat(*point[:2])), ca.vertcat(*point)))
 
 
-def _modes(estimator: Filter) -> tuple[ExtendedKalmanFilter, ...]:
-    return estimator.filters if isinstance(estimator, SwitchingFilter) else (estimator,)
+def filters_of(estimator: Filter | TrackingFilter) -> tuple[ExtendedKalmanFilter, ...]:
+    """The filter of each mode; of an observer that tracks, those over ``(x, h, theta, d)``."""
+    own = estimator.inner if isinstance(estimator, TrackingFilter) else estimator
+    return own.filters if isinstance(own, SwitchingFilter) else (own,)
 
 
 def kinds_of(soft: BoundRows, horizon: int) -> list[int]:
@@ -271,24 +285,26 @@ def _expressions(
     problem: Problem,
     asked: Mapping[str, int],
     watched: str,
+    tracked: Sequence[TrackedParameter],
 ) -> tuple[str, dict[str, int], dict[str, int]]:
     """The scalar code, the sizes that follow from it, and its operations by function."""
     n_x, n_h, n_u = model.n_x, model.n_h, model.n_u
     n_z = n_x + n_h
     padded = -(-n_z // 8) * 8
-    row = padded + n_u
+    row = padded + n_u + len(tracked)
     z, u, w = ca.SX.sym("z", n_z), ca.SX.sym("u", n_u), ca.SX.sym("w", model.n_w)
+    v = ca.vertcat(z, u, w[model.n_w - len(tracked) :])  # the Jacobian's columns
     inputs = {"z": z, "u": u, "w": w}
     point = ["const real *z", "const real *u", "const real *w"]
     texts, operations = ['#include "hmpc_math.h"\n'], {}
-    places = [*range(n_z), *range(padded, padded + n_u)]
+    places = [*range(n_z), *range(padded, row)]
 
     def add(name: str, *given: object) -> None:
         text, operations[name] = c_function(name, *given)  # type: ignore[arg-type]
         texts.append(text)
 
     cell, units = parts.cell, 0 if parts.cell is None else parts.cell.units
-    layered = layer_code("layers", parts.layers, (z, u, w), places)
+    layered = layer_code("layers", parts.layers, (z, u, w), v, places)
     texts.append(layered.text if parts.layers else "")
     operations |= layered.operations
     g = ca.SX.sym("g", layered.products or units)
@@ -298,7 +314,7 @@ def _expressions(
     sizes = {"UNITS": units, "PRODUCTS": layered.products, "THROUGH": layered.through}
     if cell is not None and parts.before is not None:
         seen = parts.before(x, h, u, w)
-        slope = ca.jacobian(seen, ca.vertcat(z, u))
+        slope = ca.jacobian(seen, v)
         rows, columns = slope.sparsity().get_triplet()
         values = [slope[i, j] for i, j in zip(rows, columns, strict=True)]
         own = next_places(z_next, g)
@@ -324,7 +340,7 @@ def _expressions(
         )
         outs = [(f"seen[{i}]", seen[i]) for i in range(seen.numel())]
         add("model_before", [*point, "real *seen"], inputs, outs)
-        slopes = [(f"by_v[{i}]", v) for i, v in enumerate(values)]
+        slopes = [(f"by_v[{i}]", value) for i, value in enumerate(values)]
         add("model_before_slope", [*point, "real *seen", "real *by_v"], inputs, outs + slopes)
     rest = [i for i in range(n_z) if i not in own]
     head, out, z_next = reduced(parts, model, rest, z, u, w) if units else (np.zeros((0, 0)), g, z_next)
@@ -334,7 +350,7 @@ def _expressions(
     point.append("const real *out")
     outs = [(f"z_next[{i}]", z_next[i]) for i in rest]
     add("model_after", [*point, "real *z_next"], inputs, outs)
-    by_out, by_v = ca.jacobian(z_next, out), ca.jacobian(z_next, ca.vertcat(z, u))
+    by_out, by_v = ca.jacobian(z_next, out), ca.jacobian(z_next, v)
     passed: list[tuple[str, ca.SX]] = []
     reached: list[int] = []
     if parts.layers:
@@ -356,6 +372,12 @@ def _expressions(
     add("model_after_slope", [*point, "real *z_next", "real *slope", "real *by_out"], inputs, outs, cleared)
     sizes["CORRECTED"] = len(corrected)
     texts.append(table("corrected", np.array(corrected, dtype=float), "int"))
+    if tracked:
+        theta, symbol = ca.SX.sym("theta", len(tracked)), ca.MX.sym("theta", len(tracked))
+        value = ca.Function("values", [symbol], [tracked_values(model, tracked, symbol)])(theta)
+        outs = [(f"value[{i}]", value[i]) for i in range(len(tracked))]
+        outs += [(f"by_theta[{i}]", ca.jacobian(value[i], theta[i])) for i in range(len(tracked))]
+        add("tracked_values", ["const real *theta", "real *value", "real *by_theta"], {"theta": theta}, outs)
     x, d, p = ca.SX.sym("x", n_x), ca.SX.sym("d", model.n_d), ca.SX.sym("p", ocp.n_p)
     if soft.functions:
         values, e = [], ca.vertcat(d, w, p)
@@ -425,7 +447,7 @@ def target_starts(own: Targets | None) -> Array:
 
 def _tables(
     model: HybridModel, ocp: OCP, problem: Problem, soft: BoundRows, fallback: HybridModel | None,
-    safe_input: Array | None, estimator: Filter | None, watched: str,
+    safe_input: Array | None, estimator: Filter | None, tracked: Sequence[TrackedParameter], watched: str,
 ) -> str:  # fmt: skip
     """Tables of problem, observer, monitor and guard."""
     dt, n = model.dt, ocp.horizon
@@ -437,7 +459,7 @@ def _tables(
     reals: dict[str, Array] = {
         "u_min": ocp.u_min, "u_max": ocp.u_max, "u_scale": ocp.input_scale, "u_rest": model.u0, "x_rest": model.x0,
         "w_rest": model.w, "du_max": np.full(model.n_u, np.inf) if ocp.du_max is None else ocp.du_max,
-        "x_reach": np.array(problem.reach),
+        "x_reach": np.array(problem.reach), "x_usable": np.array(problem.usable),
         "q_x": ocp.q * dt, "r_u": ocp.r * dt, "r_delta": ocp.r_delta * dt, "terminal": problem.terminal,
         "disturbs_u": on_u, "disturbs_x": on_x,
         "soft_lower": soft.lower[kinds], "soft_upper": soft.upper[kinds],
@@ -466,10 +488,11 @@ def _tables(
             "target_begun": own.begun[1], "target_slopes": own.slopes, "target_flat": np.array([own.flat]),
         }  # fmt: skip
     if estimator is not None:
-        modes = _modes(estimator)
+        modes = filters_of(estimator)
         switching = estimator if isinstance(estimator, SwitchingFilter) else None
         reals |= {
             "noise": np.array([f.noise[0] for f in modes]), "noise_y": np.array([f.noise[1] for f in modes]),
+            "decay": np.array([*(one.decay(dt) for one in tracked), *np.ones(model.n_d)]),
             "first_variance": np.array([f.first for f in modes]), "start_size": np.array([f.nearness for f in modes]),
             "lost_variance": np.array([np.where(f.most < np.finfo(float).max, f.most, np.inf) for f in modes]),
             "y_period": np.array([s.period for s in model.outputs]),

@@ -149,17 +149,17 @@ class LayerCode:
 
 
 def layer_code(
-    name: str, layers: Sequence[Layer], symbols: Sequence[ca.SX], places: Sequence[int], *, slopes: bool = True,
-    known: Mapping[bytes, str] | None = None,
+    name: str, layers: Sequence[Layer], symbols: Sequence[ca.SX], by: ca.SX | None = None, places: Sequence[int] = (),
+    *, known: Mapping[bytes, str] | None = None,
 ) -> LayerCode:  # fmt: skip
-    """Write the functions ``{name}(z, u, w, m)`` and, with ``slopes``, ``{name}_slope(z, u, w, m, through)``.
+    """Write the functions ``{name}(z, u, w, m)`` and, with ``by``, ``{name}_slope(z, u, w, m, through)``.
 
     Args:
         name: Prefix of all names.
         layers: The layers, in order.
         symbols: ``z, u, w`` of the model, as scalars.
-        places: Column in the Jacobian of each entry of ``(z, u)``.
-        slopes: True: also write derivatives. Default: True.
+        by: Those of these symbols with respect to which derivatives are written. Default: no derivatives.
+        places: Column in the Jacobian of each entry of ``by``.
         known: Names of existing tables by the content of their weights (:func:`tables_of`). Default: none.
 
     Raises:
@@ -168,7 +168,7 @@ def layer_code(
     z, u, w = symbols
     sizes = [len(layer.weight) for layer in layers]
     first = np.cumsum([0, *sizes])
-    m, v = ca.SX.sym("m", int(first[-1])), ca.vertcat(z, u)
+    m = ca.SX.sym("m", int(first[-1]))
     read = {"z": z, "u": u, "w": w, "m": m}
     arguments = [f"const real *{key}" for key in read]
     n_x = layers[0].seen.numel_in(0) if layers else 0
@@ -191,9 +191,9 @@ def layer_code(
             f"  {{\n    real seen[{columns}];\n    {own}_seen(z, u, w, m, seen);\n"
             f"    hmpc_layer({weight}, seen, {at});\n  }}\n"
         )
-        if not slopes:
+        if by is None:
             continue
-        by_v, by_m = ca.jacobian(seen, v), ca.jacobian(seen, m)
+        by_v, by_m = ca.jacobian(seen, by), ca.jacobian(seen, m)
         passed = _passed(by_m, owners)
         active = sorted(
             {places[c] for c in by_v.sparsity().get_triplet()[1]} | {c for k in passed for c in owners[k][3]}
@@ -245,7 +245,7 @@ def layer_code(
         f"static inline void {name}(const real *z, const real *u, const real *w, real *m) {{\n{unused}"
     )
     texts.append("".join(forward) + "}\n")
-    if slopes:
+    if by is not None:
         texts.append(
             f"static inline void {name}_slope(const real *z, const real *u, const real *w, real *m, real *through) {{\n"
             f"{unused}  (void)through;\n{''.join(backward)}}}\n"

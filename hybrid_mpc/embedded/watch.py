@@ -240,7 +240,7 @@ def _rates(model: HybridModel, parts: Cut) -> tuple[str, dict[str, int], dict[st
     inputs, point = {"z": z, "u": u, "w": w}, ["const real *z", "const real *u", "const real *w"]
     texts, operations = [], dict[str, int]()
     known = tables_of("layers", parts.layers)
-    code = layer_code("rate_layers", own.layers, (z, u, w), [], slopes=False, known=known)
+    code = layer_code("rate_layers", own.layers, (z, u, w), known=known)
     g = ca.SX.sym("g", code.products if own.cell is None else own.cell.units)
     head, out, value = np.zeros((0, 0)), g, own.after(x, h, u, w, g)
     if own.before is not None:

@@ -70,6 +70,10 @@ class TrackedParameter:
     def __post_init__(self) -> None:
         Fields(self, f"tracked parameter {self.name!r}").refuse()
 
+    def decay(self, dt: float) -> float:
+        """Factor ``a`` [-] of its deviation after a period ``dt`` [s] without excitation."""
+        return math.exp(-dt / self.time)
+
     def words(self, unit: str) -> str:
         """Its standard deviation as text; ``unit`` is the parameter's.
 
@@ -228,7 +232,7 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
     h = ca.MX.sym("h", n_h + len(places))
     theta = h[n_h:]
     chosen = _exchanged(p, places, tracked_values(model, tracked, theta))
-    decay = ca.DM([math.exp(-model.dt / one.time) for one in tracked])
+    decay = ca.DM([one.decay(model.dt) for one in tracked])
     point = [x, h, u, w, p]
     x_next, h_next = inlined(model.step, [x, h[:n_h], u, w, chosen])
     return replace(

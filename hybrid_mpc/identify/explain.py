@@ -35,7 +35,6 @@ from hybrid_mpc.identify.explanation import (
     Outcome,
     TermPicture,
     Trial,
-    bound,
 )
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit
@@ -47,6 +46,7 @@ from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior, named
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.terms import At, Term, extended
+from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -679,7 +679,7 @@ class _Explain:
             longest = samples // BLOCKS - 1
             if longest < min(LEAST, periods_of(length, dt, 2)):
                 raise InputError(
-                    f"one recording of {samples} samples is too little evidence for terms, which are judged by "
+                    f"one recording of {samples} samples is too little evidence for terms, which are evaluated on "
                     f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples "
                     "more, or a second recording [HM-IDENTIFY-012]"
                 )
@@ -714,7 +714,7 @@ class _Explain:
         if begun is not None:
             self._resume(begun)
         last: tuple[Trial, ...] = ()
-        reason = f"{most} step{'s' * (most > 1)} at most were asked for"
+        reason = f"the limit of {counted(most, 'step')} is reached"
         while sum(step.action == "added" for step in self.steps) < most:
             trials, scored, chosen = self._step()
             if chosen is None:
@@ -807,7 +807,7 @@ class _Explain:
                 own = search.begun(terms, now.theta)
                 left = math.sqrt(search.error(terms, own.theta) / ends)
                 if left > LOWERED:
-                    said = f"fitted to all data, it leaves {left:.2f} of the error"
+                    said = f"fitted to all data, the error with it is {left:.3f} times that without it"
                     yield _Fitted(forms, None, own.theta, np.zeros(0), said, worse=True)
                     continue
                 untold = search.untold(terms, own, forms)
@@ -826,21 +826,24 @@ class _Explain:
             return _Fitted(forms, None, theta, squares, "its free runs diverge")
         if found.ratio >= ADDED or squares.sum() >= self.now.squares.sum():
             less = "" if found.ratio >= ADDED else ", but the error over all samples is not smaller"
-            reason = f"the ratio to the model without it is {found.ratio:.2f}{less}"
+            reason = f"the ratio to the model without it is {found.words}{less}"
         elif found.upper >= 1.0:
             more = self.evidence.needed(squares, self.now.squares, candidates)
-            reason = f"the ratio to the model without it is {found.ratio:.2f} ({bound(found.upper)}): not significant"
+            reason = f"the ratio to the model without it is {found.words}: not significant"
             if more:
-                reason += f", {more} more recording{'s' * (more > 1)} like these would show it"
+                reason += f"; record {more} more like these to show it"
         elif self.evidence.told.recordings == 1 and found.ratio > GAIN:
             reason = (
-                f"the ratio to the model without it is {found.ratio:.2f}: blocks of one recording do not show whether "
-                "so small a gain holds in another one, record a second one"
+                f"the ratio to the model without it is {found.words}, but with a single recording it must be below "
+                f"{GAIN:g}: record a second one"
             )
         elif found.error > POOR and found.ratio > GAIN:
-            reason = f"the error is {found.error:.2f} of the outputs' spread with it: so small a gain may be chance"
+            reason = (
+                f"the ratio to the model without it is {found.words}: with an error of {found.error:.2f} spreads, a "
+                f"ratio above {GAIN:g} may be chance"
+            )
         elif untold:
-            reason = f"the data do not tell the parameters of {', '.join(term.name for term in untold)}"
+            reason = f"the data do not identify the parameters of {', '.join(term.name for term in untold)}"
         elif ends := self._at_bounds(forms, theta):
             reason = f"{', '.join(ends)} would end at a bound"
         return _Fitted(forms, found, theta, squares, reason, not reason)
@@ -882,7 +885,7 @@ class _Explain:
             between = self.evidence.compared(one.squares, chosen.squares, 1)
             outcome = "alternative" if between.lower <= 1.0 else "worse"
             reason = f"the ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
-        elif one.held_out.ratio < WORTH:
+        elif one.held_out.ratio < 1.0:
             outcome = "unsure"
         return Trial(tuple(_found(form) for form in one.forms), outcome, one.held_out, reason)
 
@@ -984,7 +987,7 @@ def _reason(trials: Sequence[Trial], pieces: int) -> str:
     """Reason why the search ends."""
     judged = [trial for trial in trials if trial.held_out is not None]
     if not judged:
-        return "no other term promises to lower the error"
+        return "no further candidate lowers the error in a Gauss-Newton step"
     best = min(judged, key=lambda trial: trial.held_out.ratio if trial.held_out else math.inf)
     return f"{best.name}: {best.reason}" if best.reason else f"{best.name}: one of its terms is not needed"
 

@@ -72,6 +72,17 @@ class HeldOutError:
     upper: float
     harm: float
 
+    @property
+    def words(self) -> str:
+        """Ratio with its interval.
+
+        Example:
+            >>> HeldOutError(0.1, 0.954, 0.8, 1.13, 0.2).words, HeldOutError(0.1, 0.954, 0.0, math.inf, 1.0).words
+            ('0.95 (0.80 to 1.13)', '0.95 (no upper end)')
+        """
+        ends = f"{self.lower:.2f} to {self.upper:.2f}" if self.lower > 0.0 else _bound(self.upper)
+        return f"{self.ratio:.2f} ({ends})"
+
 
 @dataclass(frozen=True)
 class FoundTerm:
@@ -104,8 +115,8 @@ class Trial:
     Args:
         terms: The candidate's terms: one, or a pair.
         outcome: ``"added"``; ``"alternative"``: not significantly different from the added terms; ``"unsure"``: the
-            error is smaller, but not significantly; ``"worse"``: the error is not smaller; ``"diverged"``: the fit
-            failed.
+            error is smaller, but not significantly; ``"worse"``: the error is not smaller, or surely larger than with
+            the added terms; ``"diverged"``: the fit failed.
         held_out: Error over held-out data; None if the fit failed or did not reduce the error over all data.
         reason: Why the candidate was not added; empty if it was.
     """
@@ -119,6 +130,14 @@ class Trial:
     def name(self) -> str:
         """Names of its terms."""
         return _named(self.terms)
+
+    @property
+    def outcome_words(self) -> str:
+        """The outcome for a reader."""
+        smaller = self.held_out is not None and self.held_out.ratio < 1.0
+        if self.outcome == "worse" and (smaller or self.held_out is None):
+            return "worse than the added term" if smaller else "no gain"
+        return "not surely better" if self.outcome == "unsure" else self.outcome
 
 
 @dataclass(frozen=True)
@@ -297,11 +316,11 @@ def _named(terms: Sequence[FoundTerm]) -> str:
     return " and ".join(term.name for term in terms)
 
 
-def bound(upper: float) -> str:
+def _bound(upper: float) -> str:
     """Text of the upper end of an interval.
 
     Example:
-        >>> bound(0.912), bound(math.inf)
+        >>> _bound(0.912), _bound(math.inf)
         ('upper end 0.91', 'no upper end')
     """
     return f"upper end {upper:.2f}" if math.isfinite(upper) and upper < 1e6 else "no upper end"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ which a delay of 4e-5 periods can explain."""
 TELLING = 0.9
 """Share of the training error and of the validation error below which a delay causes a warning; the delay must also be
 at least twice its standard error."""
+ADD_DELAY = "Fit the delay (largest_delay of the data), or add the lag of the actuator to the prior"
+"""Remedy for late inputs."""
 
 
 def warnings_of(
@@ -76,31 +79,76 @@ def late_inputs(
     the parameters alone; both are fitted to the same windows of the first part.
     """
     late = fit.with_delay(LATE * fit.dt)
-    known = fit.prior.states, fit.prior.outputs, first_states
     problems: list[Shooting] = []
     for part in parts:
         if (longest := min(periods, most_samples(part) - late.lead - 1)) >= 2:
-            windows = cut_outputs(part, longest, late.lead, FEW, *known)
+            windows = cut_outputs(
+                part, longest, late.lead, FEW, fit.prior.states, fit.prior.outputs, first_states
+            )
             problems.append(Shooting(late, windows, sizes))
         elif not problems:
             return ()
-    without_delay = Shooting(fit, problems[0].windows, sizes)
+    found = fitted_delay(fit, theta, problems)
+    return (
+        ()
+        if found is None or not found.surely
+        else (
+            f"{found}: such a delay would reduce the errors over training and validation recordings to "
+            f"{' and '.join(f'{ratio:.2f}' for ratio in found.ratios)}. {ADD_DELAY} [HM-IDENTIFY-080]",
+        )
+    )
+
+
+@dataclass(frozen=True)
+class FittedDelay:
+    """A delay of the inputs that the prior lacks.
+
+    Args:
+        delay: The delay [s].
+        error: Its standard error [s].
+        ratios: Errors of free runs with the delay over those without, of each part of the recordings [-].
+        longest: Whether it is the longest delay that was tested.
+    """
+
+    delay: float
+    error: float
+    ratios: tuple[float, ...]
+    longest: bool
+
+    @property
+    def surely(self) -> bool:
+        """Whether the delay is distinct from zero and reduces the error of every part."""
+        return max(self.ratios) < TELLING and self.delay > 2.0 * self.error
+
+    def __str__(self) -> str:
+        least = "at least " if self.longest else ""
+        return f"inputs seem to act {least}{self.delay:.2g} s later than recorded (standard error {self.error:.1g} s)"
+
+
+def fitted_delay(fit: OutputFit, theta: Array, problems: Sequence[Shooting]) -> FittedDelay | None:
+    """Fit a delay and the parameters to the first problem, and compare the errors of all problems.
+
+    Args:
+        fit: The fit without a delay.
+        theta: Parameters to start from.
+        problems: Windows of parts of the recordings, of the fit with a delay (:meth:`OutputFit.with_delay`).
+
+    Returns:
+        The delay; None if a linear step shows that it does not reduce the error, or if it is as short as an error of
+        the integration.
+    """
+    without_delay = Shooting(fit, problems[0].windows, problems[0].sizes)
     # error after a linear step with a delay over that without, above which no delay is fitted
     if _share_with_delay(problems[0], theta, without_delay.first_states(theta)) > 0.98:
-        return ()
+        return None
     at_once = without_delay.solve(theta, START_ITERATIONS)
     found = problems[0].solve(np.append(theta, 0.5), START_ITERATIONS)
     both = np.array([problem.explained([np.append(at_once.theta, 0.0), found.theta]) for problem in problems])
     delay, error = found.theta[-1] * fit.dt, math.sqrt(max(found.covariance[-1, -1], 0.0)) * fit.dt
-    if not ((both[:, 1] < TELLING * both[:, 0]).all() and delay > max(2.0 * error, SHORTEST * fit.dt)):
-        return ()
-    left = " and ".join(f"{then / before:.2f}" for before, then in both)
-    least = "at least " if found.theta[-1] > (1.0 - AT_BOUND) * LATE else ""
-    return (
-        f"inputs seem to act {least}{delay:.2g} s later than recorded (standard error {error:.1g} s): such a delay "
-        f"would reduce the errors over training and validation recordings to {left}. Fit the delay (largest_delay of "
-        "the data), or add the lag of the actuator to the prior",
-    )
+    if not delay > SHORTEST * fit.dt:
+        return None
+    ratios = tuple(float(then / max(before, 1e-300)) for before, then in both)
+    return FittedDelay(float(delay), error, ratios, bool(found.theta[-1] > (1.0 - AT_BOUND) * LATE))
 
 
 def _share_with_delay(problem: Shooting, theta: Array, x: Array) -> float:

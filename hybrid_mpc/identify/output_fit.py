@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cached_property, lru_cache
 from typing import Literal, TypeAlias
 
@@ -39,11 +39,18 @@ class OutputFit:
         make: Prior class or factory ``(values=None) -> Prior``.
         dt: Model period [s].
         largest_delay: Largest delay [s] of the inputs. Default 0: no delay is fitted.
+        only: Names of the parameters to fit. Default: all that are not fixed.
     """
 
-    def __init__(self, make: Callable[..., Prior], dt: float, largest_delay: float = 0.0) -> None:
+    def __init__(
+        self,
+        make: Callable[..., Prior],
+        dt: float,
+        largest_delay: float = 0.0,
+        only: Collection[str] | None = None,
+    ) -> None:
         self.make, self.prior, self.dt, self.largest = make, make(), dt, largest_delay
-        self.free = [p for p in self.prior.parameters if not p.fixed]
+        self.free = [p for p in self.prior.parameters if not p.fixed and (only is None or p.name in only)]
         late = [dt] if largest_delay else []
         own = [abs(p.value) if p.value else (p.upper - p.lower) for p in self.free]
         self.unit = np.array([*own, *late])

@@ -152,7 +152,7 @@ def find_varying(
     if not of.free:
         return Varying((), 0, reason="the prior has no free parameter")
     known = smoothed(make, fit, recordings, dt)
-    pieces, blocks = _pieces(known)
+    pieces, blocks = pieces_of(known)
     longest = [max(len(t.t) for t in part) for part in pieces]
     periods = min(round(length / dt), min(longest) // WINDOWS_OF_EACH)
     if periods < SHORTEST:
@@ -197,8 +197,8 @@ def find_varying(
     return Varying(found, len(pieces), blocks)
 
 
-def _pieces(known: Sequence[Trajectory]) -> tuple[list[list[Trajectory]], bool]:
-    """The trajectories of each recording, or the blocks of a single one."""
+def pieces_of(known: Sequence[Trajectory]) -> tuple[list[list[Trajectory]], bool]:
+    """The trajectories of each recording; or the blocks of a single one, and True."""
     files: dict[str, list[Trajectory]] = {}
     for t in known:
         files.setdefault(t.file, []).append(t)

@@ -8,6 +8,7 @@ import numpy as np
 
 from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.tracking import TrackingFilter, with_tracked
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import make_ocp, make_resting_guard
 from hybrid_mpc.loop.guard import Guard
@@ -18,8 +19,8 @@ REACTIONS = ("", "rest", "adapt")
 
 
 def generate_controller(
-    kit: Kit, folder: str | Path, *, model: str = "", task: str = "", load: bool = True, single: bool = False,
-    monitor: bool = True, guard: str = "", check: bool = False,
+    kit: Kit, folder: str | Path, *, model: str = "", task: str = "", load: bool = True, tracking: bool = False,
+    single: bool = False, monitor: bool = True, guard: str = "", check: bool = False,
 ) -> Path:  # fmt: skip
     """Write estimator, real-time iteration, safeguards, monitor and guard as C11, with a test program and a README.
 
@@ -31,6 +32,9 @@ def generate_controller(
         model: Name of the model of controller and estimator. Default: the recommended model.
         task: Task whose control problem is solved. Default: the common control problem.
         load: Whether the estimator estimates an unknown load, as :meth:`Kit.observer`. Default: True.
+        tracking: Whether the estimator tracks the parameters that differ between recordings, and the controller plans
+            with them, as :meth:`Kit.tracking_observer`; of ``kit.blended()`` the share of the correction is one of
+            them. Default: False.
         single: Whether numbers are ``float``. Default: False, ``double``.
         monitor: Whether :meth:`Kit.monitor` watches the loop. Default: True.
         guard: Reaction to alarms of ``kit.monitor(kind="guard")``: ``"rest"``, the safe input while a sensor is frozen;
@@ -60,14 +64,20 @@ def generate_controller(
         raise InputError(
             f"guard: {guard!r} reacts to alarms, so it needs the monitor; set monitor=True [HM-KIT-025]"
         )
-    name = model or kit.recommended
-    estimator = kit.observer(name, task=task, load=load)
-    prior = kit.models["prior"]
+    if tracking and guard == "adapt":
+        raise InputError(
+            "guard: 'adapt' and tracking=True both estimate changed parameters; choose one of them [HM-KIT-043]"
+        )
+    name, prior = model or kit.recommended, kit.models["prior"]
+    make = kit.tracking_observer if tracking else kit.observer
+    estimator = make(name, task=task, load=load)
+    if isinstance(estimator, TrackingFilter):
+        prior = with_tracked(prior, estimator.tracked)
     safe = None if kit.safe_input is None else np.array(kit.safe_input)
     write_controller(
-        place, kit.models[name], make_ocp(prior, kit.problem(task)), estimator=estimator, fallback=prior,
+        place, estimator.model, make_ocp(prior, kit.problem(task)), estimator=estimator, fallback=prior,
         safe_input=safe, single=single,
-        monitor=kit.monitor(name, task=task, kind="guard" if guard else "") if monitor else None,
+        monitor=kit.monitor(name, task=task, kind="guard" if guard else "", tracking=tracking) if monitor else None,
         guard=_guard(kit, name, task, guard), check=check,
     )  # fmt: skip
     return place

@@ -26,13 +26,13 @@ from hybrid_mpc.plots.style import (
     name_of,
     new_column,
     new_figure,
-    number,
     plain,
     plain_log,
     plot_inputs,
     shared_legend,
     title_axes,
 )
+from hybrid_mpc.rules import time_text
 
 Limits: TypeAlias = tuple[Sequence[float] | Array, Sequence[float] | Array]
 """Lower and upper bounds, one a signal."""
@@ -229,14 +229,14 @@ def solve_times(times_ms: Mapping[str, Array], period_ms: float) -> Figure:
     high = max(period_ms, *(v[-1] for v in data.values()))
     bins = np.geomspace(0.9 * low, 1.15 * high, 60)
     for name, v in data.items():
-        note = f"{name_of(name)}: median {number(np.median(v))} ms, p99 {number(np.quantile(v, 0.99))} ms"
+        note = f"{name_of(name)}: median {time_text(float(np.median(v)))}, p99 {time_text(float(np.quantile(v, 0.99)))}"
         weights = np.full(len(v), 100.0 / len(v))
         left.hist(v, bins, weights=weights, color=colour(name), alpha=0.3)
         left.hist(v, bins, weights=weights, color=colour(name), histtype="step", linewidth=1.3)
         longer = 100.0 * np.arange(len(v), 0, -1) / len(v)
         right.step(v, longer, where="post", color=colour(name), linewidth=1.6, label=note)
     for ax in (left, right):
-        ax.axvline(period_ms, color="black", linewidth=1.6, label=f"deadline {number(period_ms)} ms")
+        ax.axvline(period_ms, color="black", linewidth=1.6, label=f"deadline {time_text(period_ms)}")
         ax.set_xscale("log")
         ax.set_xlim(bins[0], bins[-1])
         ax.set_xlabel("duration of a controller step [ms]")

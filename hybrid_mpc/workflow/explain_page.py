@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hybrid_mpc.identify.explain import ADDED, DOUBT, GAIN, POOR
-from hybrid_mpc.identify.explanation import ExplainStep, Explanation, Trial, bound
+from hybrid_mpc.identify.explanation import ExplainStep, Explanation, Trial
 from hybrid_mpc.plots import explain as plots
 from hybrid_mpc.plots.style import save
 from hybrid_mpc.report.page import Hint, KeyFigure, Report, Section, Table, write_report
@@ -17,6 +17,11 @@ from hybrid_mpc.workflow.explained import ExplainResult, state_of
 PAGE = "explain.html"
 RATIO = "ratio to the previous step"
 """Heading of the ratios of errors, on the page and in the terminal."""
+ALONE = (
+    f"The evidence is a single recording: a term must reduce the error by more than {1 - GAIN:.0%}, and products and "
+    "couplings are no candidates."
+)
+"""Rule for a single recording."""
 SPREADS = "over the outputs' spreads"
 MODELS = {"nominal": "prior, nominal", "fitted": "prior, fitted", "explained": "prior with the found terms"}
 
@@ -83,18 +88,6 @@ def signed(step: ExplainStep) -> str:
     return f"{'+' if step.action == 'added' else '−'} {step.name}"
 
 
-def interval(step: ExplainStep) -> str:
-    """Ratio of errors with its interval.
-
-    Example:
-        ``"0.42 (0.31 to 0.55)"``
-    """
-    own = step.held_out
-    if own.lower <= 0.0:
-        return f"{own.ratio:.2f} ({bound(own.upper)})"
-    return f"{own.ratio:.2f} ({own.lower:.2f} to {own.upper:.2f})"
-
-
 def values_of(step: ExplainStep) -> str:
     """Fitted values of a step's parameters with their standard errors."""
     return ", ".join(str(p).replace("+-", "±").removesuffix(" -") for p in step.parameters)
@@ -108,7 +101,7 @@ def alternatives_of(step: ExplainStep) -> str:
 def steps_table(explanation: Explanation) -> Table:
     """A row a step."""
     rows = [
-        (signed(s), s.held_out.error, interval(s), values_of(s), alternatives_of(s))
+        (signed(s), s.held_out.error, s.held_out.words, values_of(s), alternatives_of(s))
         for s in explanation.steps
     ]  # fmt: skip
     return Table(
@@ -119,7 +112,8 @@ def steps_table(explanation: Explanation) -> Table:
             *rows,
         ],
         f"Steps of the search, evaluated on {explanation.evidence.text}. Errors: all samples together. Ratios: "
-        f"{explanation.averaged}, with an interval for all fitted candidates of a step together.",
+        f"{explanation.averaged}, with an interval for all fitted candidates of a step together."
+        + (f" {ALONE}" if explanation.evidence.recordings == 1 else ""),
     )
 
 
@@ -165,7 +159,13 @@ def _trials(explanation: Explanation) -> list[tuple[str, Trial]]:
 def trials_table(explanation: Explanation) -> Table:
     """A row a candidate that was fitted and not added."""
     rows = [
-        (number, trial.name, trial.held_out.ratio if trial.held_out else None, trial.outcome, trial.reason)
+        (
+            number,
+            trial.name,
+            trial.held_out.ratio if trial.held_out else None,
+            trial.outcome_words,
+            trial.reason,
+        )
         for number, trial in _trials(explanation)
     ]
     return Table(
@@ -200,8 +200,8 @@ def _judged(explanation: Explanation) -> Sequence[str]:
         f"probability of {DOUBT:.0%}, for all fitted candidates of the step together. In the upper end, a reduction by "
         f"more than {1 - GAIN:.0%} counts as {1 - GAIN:.0%}.",
         "A term is not added if its parameters are not identifiable, if one ends at its bound, or if the error with "
-        f"the term stays above {POOR:g} and its ratio above {GAIN:g}. With a single recording, the ratio must be below "
-        f"{GAIN:g}.",
+        f"the term stays above {POOR:g} and its ratio above {GAIN:g}.",
+        *([ALONE] if own.recordings == 1 else []),
         "Errors are root mean squares over all held-out samples, divided by the outputs' spreads.",
     )
 
@@ -228,7 +228,7 @@ def _hints(found: ExplainResult) -> Sequence[Hint]:
         hints.append(
             Hint(
                 "plain",
-                "No term was added.",
+                "No term was added, so no scenario file was written.",
                 "The prior may lack dynamics that no library term describes: hybrid-mpc run trains networks.",
             )
         )

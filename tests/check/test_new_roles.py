@@ -201,6 +201,16 @@ def test_a_set_point_that_nothing_follows_is_to_be_decided():
     assert followed["jacket_set"].sure
 
 
+def test_a_set_point_that_nothing_follows_is_no_sign_of_a_closed_loop(tmp_path):
+    u, feed = steps(), steps(seed=3)
+    table = {"jacket_set": u, "feed": feed, "temp": 0.4 * lag(u, 60) + 0.2 * lag(feed)}
+    for name, more in (("a", {}), ("b", {"jacket": lag(u, 3)})):
+        file = write_csv(tmp_path / f"{name}.csv", {"t": np.arange(1500.0), **table, **more})
+        draft = write_scenario(tmp_path / f"{name}.py", file, inputs=["feed"], outputs=["temp"])
+        assert [c.full for c in draft.set_points] == ["jacket_set"]
+        assert bool(draft.loop) == bool(more)
+
+
 def test_what_a_drive_measures_stands_in_for_a_command_that_is_not_recorded():
     u = steps()
     answer = lag(u, 2)
@@ -255,7 +265,8 @@ def test_a_rate_and_a_follower():
         ("Sollwert", "", "set-point"), ("set_point_1", "", "set-point"), ("offset", "", "label"),
         ("reset", "", ""), ("spin", "", ""), ("Stellgröße", "", "command"), ("motor_voltage_meas", "", "answer"),
         ("q1_kw", "kW", ""), ("q1_rad", "rad", "quantity"), ("deg", "", ""), ("x", "", "quantity"),
-        ("y2", "", "measured"), ("force_y", "", ""),
+        ("y2", "", "measured"), ("force_y", "", ""), ("sog_kn", "kn", ""), ("thrust_kN", "kN", "actuator"),
+        ("gyro_dps", "deg/s", "measured"),
     ],
 )  # fmt: skip
 def test_what_a_name_says(name, unit, role):

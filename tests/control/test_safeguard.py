@@ -9,7 +9,7 @@ from control_parts import POINT, pendulum_problem, plan_of
 from control_parts import estimate_of as estimate_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from online_models import linear_model, pendulum_model
+from online_models import levitated_ball, linear_model, pendulum_model
 
 from hybrid_mpc import (
     OCP,
@@ -157,6 +157,23 @@ def test_initial_starts_within_the_bounds(parts):
     positive = OCP(5, [1.0, 1.0], [1.0], [0.0], [0.5], [1.0], working_point=POINT)
     only_up = SafeController(CondensedController(prior, positive))
     np.testing.assert_array_equal(only_up.initial(estimate_of([0.0, 0.0], n_h=0)).u, [0.5])
+
+
+@pytest.mark.parametrize("fails", [(), (3, 4)])
+def test_an_unstable_machine_is_not_planned_along_its_free_run(fails):
+    """Over 50 periods the free run leaves the coil's range and passes a pole: no linearization there is of use."""
+    model = levitated_ball()
+    ocp = OCP(50, [0.3**-2, 0.0, 0.0], [0.0], [4.0**-2], [0.0], [24.0])
+    safe = SafeController(CondensedController(model, ocp), model, max_age=50)
+    x, rng = model.x0 + np.array([-0.1, -2.0, 0.0]), np.random.default_rng(0)
+    decision = safe.initial(estimate_at(model, x))
+    for k in range(40):
+        goal = model.x0[None] if k not in fails else np.full((1, 3), np.nan)  # a solve that fails
+        seen = x + rng.normal(size=3) * [0.01, 1.0, 0.005]
+        decision = safe.decide(decision, estimate_at(model, seen), goal)
+        assert decision.status is (Status.SOLVED if k not in fails else Status.NOT_FINITE)
+        x = model.step(x, [], decision.u, model.w, model.p)[0].full().ravel()
+    assert abs(x[0] - 7.0) < 0.1
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from hybrid_mpc import (
     simulate,
 )
 from hybrid_mpc.embedded.generate import sources_of
-from hybrid_mpc.loop.preview import Forecast, Previews
+from hybrid_mpc.loop.preview import Forecast, Previews, n_tracked
 
 SHARED = [*parts.QUICK, "-fPIC", "-shared"]
 BRIDGE = """
@@ -104,7 +104,10 @@ class Whole:
 
     def _fields(self, sizes, case):
         m = self.model
-        found = {name: (name, np.float64, (n,)) for name, n in (("x", m.n_x), ("d", m.n_d), ("u", m.n_u))}
+        found = {
+            name: (name, np.float64, (n,))
+            for name, n in (("x", m.n_x), ("d", m.n_d), ("w", m.n_w), ("u", m.n_u))
+        }
         found |= {name: (name, np.int32, ()) for name in ("status", "source", "age")}
         if case.guard is not None:
             found |= {f"guard_{name}": (f"guard.{name}", np.int32, ()) for name in ("mode", "wanted")}
@@ -173,17 +176,19 @@ def replay(whole, case, *, own=False, told=True, known=None):
     preview = Previews(
         case.reference, case.weight, ocp, model.dt, np.inf, case.safe.controller.problem.standing()[0]
     )
-    forecast = Forecast(case.w, ocp, model.n_w, model.dt)
+    n_measured = model.n_w - n_tracked(case.estimator)
+    forecast = Forecast(case.w, ocp, n_measured, model.dt)
     size = case.safe.controller.problem.sizes.states
     names = {name: own for name, own in READ.items() if f"monitor_{own}" in view}
     found, wanted = {name: [] for name in names}, {name: [] for name in names}
     largest_u = largest_x = 0.0
+    ws = []
     wide = 0
     said = {Mode[name]: 0 for name in {*result.mode}}
     for k, step in enumerate(steps):
         rows, weight = preview(k * model.dt)
         goal = parts.goal(rows, weight, ocp=ocp, w=forecast(k * model.dt))
-        w = step.estimate.w if model.n_w else np.zeros(1)
+        w = step.estimate.w[:n_measured] if n_measured else np.zeros(1)
         if k == 0:
             whole.call("hmpc_start", step.y, w, None, goal)
         else:
@@ -204,12 +209,17 @@ def replay(whole, case, *, own=False, told=True, known=None):
             said[Mode[result.mode[k]]] += 1
         scale = np.maximum(size, np.abs(step.estimate.x))
         largest_x = max(largest_x, float(np.max(np.abs(view["x"] - step.estimate.x) / scale)))
+        ws.append((view["w"].copy(), step.estimate.w))
         whole.call("hmpc_finish", goal)
         for name in SAID:
             assert int(view[f"monitor_{name}"]) == int(getattr(step.reading, name)), (k, name)
         for name, place in names.items():
             found[name].append(np.array(view[f"monitor_{place}"]))
             wanted[name].append(np.array(getattr(step.reading, name)))
+    if model.n_w:
+        got, want = (np.array(v) for v in zip(*ws, strict=True))
+        scale = np.maximum(np.max(np.abs(want), axis=0), 1e-300)
+        largest_x = max(largest_x, float(np.max(np.abs(got - want) / scale)))
     largest = 0.0
     for name in names:
         got, want = (np.array(v).reshape(len(steps), -1) for v in (found[name], wanted[name]))

@@ -14,10 +14,11 @@ import embedded_parts as parts
 import numpy as np
 import pytest
 from embedded_parts import needs_compiler
+from online_models import levitated_ball
 
 import hybrid_mpc as hm
 import nn_export.files
-from hybrid_mpc import ChannelLimit, CondensedController, InputError, WatchLimits, set_limits
+from hybrid_mpc import OCP, ChannelLimit, CondensedController, InputError, WatchLimits, set_limits
 from hybrid_mpc.embedded import export
 from hybrid_mpc.embedded.export import OTHERS, TOLERANCE
 from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, _config, make_sources
@@ -309,11 +310,24 @@ def test_the_check_compiles_runs_and_measures(tmp_path, monkeypatch):
     export.write_controller(tmp_path / "a", model, ocp, check=True)
     assert ran
     assert re.search(r"flash: code and tables \| [\d,]+", (tmp_path / "a" / "README.md").read_text())
-    monkeypatch.setattr(export, "_vectors", lambda *given, own=export._vectors: own(*given).replace(
-        "vector_u[25][1] = {\n  {R(", "vector_u[25][1] = {\n  {R(9"))  # fmt: skip
+    own = export._vectors
+    monkeypatch.setattr(export, "_vectors", lambda *given: (1e-9, own(*given)[1].replace(
+        "vector_u[25][1] = {\n  {R(", "vector_u[25][1] = {\n  {R(9")))  # fmt: skip
     with pytest.raises(InputError, match="HM-EMBEDDED-004"):
         export.write_controller(tmp_path / "b", model, ocp, check=True)
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@needs_compiler
+def test_rounding_that_an_unstable_machine_amplifies_is_tolerated(tmp_path):
+    model = levitated_ball()
+    ocp = OCP(50, [0.3**-2, 0.0, 0.0], [0.0], [4.0**-2], [0.0], [24.0])
+    export.write_controller(tmp_path / "ball", model, ocp, check=True)
+    tolerance = float(
+        re.search(r"VECTOR_TOLERANCE R\((.*)\)", (tmp_path / "ball/hmpc_vectors.h").read_text())[1]
+    )
+    assert 1e-9 <= tolerance < 1e-6
+    assert f"{tolerance:.2g}" in (tmp_path / "ball/README.md").read_text()
 
 
 HOSTILE = (

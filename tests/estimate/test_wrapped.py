@@ -67,7 +67,13 @@ def test_an_output_that_is_not_periodic_keeps_its_sample():
 
 def test_the_period_is_that_of_the_unit():
     found = {unit: Signal("a", unit, periodic=True).period for unit in ("rad", "deg", "rev", "turn", "mrad")}
-    assert found == {"rad": 2 * math.pi, "deg": 360.0, "rev": 1.0, "turn": 1.0, "mrad": pytest.approx(2000 * math.pi)}
+    assert found == {
+        "rad": 2 * math.pi,
+        "deg": 360.0,
+        "rev": 1.0,
+        "turn": 1.0,
+        "mrad": pytest.approx(2000 * math.pi),
+    }
     assert Signal("a", "rad", periodic=True).radians == 1.0 and Signal("a", "m").period == math.inf
     for unit in ("m", "-", "furlong", "rad/s"):
         with pytest.raises(InputError, match="HM-MACHINE-047"):

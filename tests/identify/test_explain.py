@@ -1,6 +1,7 @@
 """The search for missing terms: a term that was taken out is found, and none is added where none is missing."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,15 +19,18 @@ from hybrid_mpc import (
     Trajectory,
     fit_prior,
 )
+from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.identify import term_table
-from hybrid_mpc.identify.explain import _Explain, explain
-from hybrid_mpc.identify.explanation import Explanation, HeldOutError
+from hybrid_mpc.identify.explain import _Explain, _Fitted, explain
+from hybrid_mpc.identify.explanation import Evidence, Explanation, HeldOutError, Trial
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import visited
 from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.machine import terms
 from hybrid_mpc.machine.terms import At, Term, extended
 from hybrid_mpc.records import plain, record
+from hybrid_mpc.workflow.explain_page import ALONE, steps_table
+from hybrid_mpc.workflow.explained import ExplainResult
 
 DT = 0.02
 
@@ -387,6 +391,34 @@ def test_a_single_recording_must_show_more(recordings, ratio, added):
     )
     judged = _Explain._judged(search, (), np.zeros(1), 0.5 * np.ones((2, 3)), 10, [])
     assert judged.sure == bool(added)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "outcome", "words"),
+    [(0.97, "unsure", "not surely better"), (0.8, "unsure", "not surely better"), (1.1, "worse", "worse")],
+)
+def test_the_outcome_does_not_contradict_the_ratio(ratio, outcome, words):
+    error = HeldOutError(error=0.1, ratio=ratio, lower=0.7, upper=1.2, harm=0.5)
+    trial = _Explain._trial(
+        SimpleNamespace(), _Fitted((), error, np.zeros(1), np.zeros(1), "why", False), None
+    )
+    assert (trial.outcome, trial.outcome_words) == (outcome, words)
+    assert "(0.70 to 1.20)" in error.words
+    among = Trial((), "worse", replace(error, ratio=0.6))  # beside an added term that is surely better
+    assert among.outcome_words == "worse than the added term"
+    assert Trial((), "worse", None).outcome_words == "no gain"
+
+
+def test_the_rule_for_a_single_recording_stands_where_it_applies():
+    for count in (1, 5):
+        own = Explanation(
+            "Prior", 1.0, 0.1, HeldOutError(0.1, 1.0, 1.0, 1.0, 1.0), (), (), (),
+            Evidence(count, 8, 5, 1.0, f"{count} recordings"), 30, "no gain",
+        )  # fmt: skip
+        assert (ALONE in steps_table(own).caption) == (count == 1)
+        lines = summary(ExplainResult("tank", own, 0.0, 0.01), Path("out"))
+        assert (ALONE in lines) == (count == 1)
+        assert "no scenario file was written" in lines[-1]
 
 
 def test_the_page_of_terms_is_that_of_the_library():

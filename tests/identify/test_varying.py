@@ -9,7 +9,7 @@ from hybrid_mpc import InputError, Parameter, Prior, Signal, fit_prior
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
-from hybrid_mpc.identify.ahead import choose_tracked, errors_ahead
+from hybrid_mpc.identify.ahead import _unlearned, choose_tracked, errors_ahead
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.varying import find_varying
 from hybrid_mpc.kit.artifact import build_model
@@ -141,6 +141,7 @@ def test_predictions_from_the_observer_improve_where_a_parameter_varies():
     chosen = choose_tracked([[(observer(fit), recorded(GAINS, seed=5))]], found, 2.0, warm_up=1.0)
     assert chosen.tracked[0].name == "gain"
     assert chosen.ratio["heat"] < 0.8
+    assert chosen.doubts == ()
     held = recorded([1.4, 2.8], seed=9)
     plain = errors_ahead(observer(fit), held, 2.0, warm_up=10.0)
     tracked = errors_ahead(TrackingFilter(observer(fit), chosen.tracked), held, 2.0, warm_up=10.0)
@@ -202,3 +203,24 @@ def test_a_parameter_of_the_sensor_varies_but_is_no_candidate():
     assert "scale" not in {one.name for one in chosen.tracked} | {
         name for names in chosen.tried for name in names.split(", ")
     }
+
+
+def test_a_load_that_stays_beside_an_unlearned_parameter_is_doubted():
+    """An observer that blames a load for everything, as one whose noise was tuned on a prior without a lag does."""
+    fit, found = varying_of(Heater, recorded(GAINS))
+    made = observer(fit)
+    blaming = made.same_on(
+        made.model,
+        sigma_y=[0.5],
+        sigma_x=[0.5],
+        sigma_x0=[0.1],
+        sigma_d=[0.1],
+        sigma_d0=[2.0],
+        sigma_h=[],
+        sigma_h0=[],
+    )
+    gain = found.parameters[0].tracked()
+    (doubt,) = _unlearned(blaming, recorded(GAINS[:3], seconds=10.0, seed=5), (gain,))
+    assert "HM-IDENTIFY-083" in doubt
+    assert "gain" in doubt
+    assert _unlearned(made, recorded(GAINS[:3], seed=5), (gain,)) == ()

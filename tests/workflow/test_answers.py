@@ -10,6 +10,7 @@ from hybrid_mpc import Promise
 from hybrid_mpc.report.page import Report, render
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.answers import answer_all, controller_answer, model_answer, monitor_answer
+from hybrid_mpc.workflow.stages.on_model import OnModelResult
 from hybrid_mpc.workflow.stages.report import oracle_words
 from hybrid_mpc.workflow.stages.results import Results, read_results
 from hybrid_mpc.workflow.stages.watch import CleanAlarms
@@ -101,6 +102,15 @@ def test_without_a_loop_nothing_is_said_to_be_safe(results, why):
     answer = controller_answer(replace(results, control=none))
     assert answer.verdict == "plain"
     assert "Closed loops: the scenario has no plant." in answer.lines
+
+
+def test_loops_on_a_model_show_no_safety_and_long_times_are_in_seconds(results):
+    none, own = replace(results.control, rows=(), reason="no plant"), OnModelResult({}, {}, True, ())
+    answer = controller_answer(replace(results, control=none, on_model=own))
+    assert answer.verdict == "plain"
+    assert answer.short.startswith("Not shown")
+    slow = controller_answer(steps(results, period=1e4, p99=2.5))
+    assert "the period is 10 s." in lines(slow)
 
 
 def test_a_monitor_is_judged_by_its_false_alarms_and_by_the_faults_that_it_finds(results):

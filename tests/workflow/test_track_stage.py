@@ -66,6 +66,7 @@ def test_the_stage_finds_what_varies_and_is_then_up_to_date(files, tmp_path):
     assert found.varying.pieces == 4
     assert "gain" in [one.name for one in found.tracking.tracked]
     assert found.tracking.ratio["heat"] < 0.97
+    assert any("HM-IDENTIFY-082" in one for one in context.prior.fit.warnings)  # said before any tracking
     assert bring_up_to_date(context, TRACK) == "up to date"
     rows = _varying_table(found).rows
     assert [row[0] for row in rows] == ["gain [K/W]", "tau [s]"]

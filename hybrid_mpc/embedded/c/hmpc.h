@@ -23,11 +23,13 @@
 #define HMPC_NV (HMPC_BLOCKS * HMPC_NU)      /* unknowns of the QP: inputs of the move blocks */
 #define HMPC_LD HMPC_ROUND(HMPC_NV)          /* length of a row over the unknowns */
 #define HMPC_LZ HMPC_ROUND(HMPC_NZ)          /* length of a row over z, padded with zeros */
-#define HMPC_LJ (HMPC_LZ + HMPC_NU)          /* length of a row of a stage's Jacobian: by z, then by u */
+#define HMPC_MEASURED (HMPC_NW - HMPC_TRACKED) /* measured disturbances; tracked parameters follow them in w */
+#define HMPC_LJ (HMPC_LZ + HMPC_NU + HMPC_TRACKED) /* length of a row of a stage's Jacobian: by z, u, tracked parameters */
 #define HMPC_SOFT (HMPC_N * (HMPC_SOFT_X + HMPC_SOFT_E)) /* rows of soft and hard bounds: states, then expressions */
 #define HMPC_KINDS (HMPC_SOFT_X + HMPC_SOFT_E) /* soft and hard bounds of a period, without the inputs' limits */
 #define HMPC_MOST (HMPC_NV + HMPC_SOFT)      /* maximum number of active bounds */
-#define HMPC_NE (HMPC_NZ + HMPC_ND)          /* estimated states: x, h, d */
+#define HMPC_AT_D (HMPC_NZ + HMPC_TRACKED)   /* place of d among the estimated states */
+#define HMPC_NE (HMPC_AT_D + HMPC_ND)        /* estimated states: x, h, deviations of tracked parameters, d */
 #define HMPC_LE HMPC_ROUND(HMPC_NE)
 #define HMPC_NT (HMPC_NZ + HMPC_NU)          /* unknowns of a steady state: z, u */
 #define HMPC_NC (HMPC_NX + HMPC_NU)          /* arguments of a stage cost: x, u */
@@ -63,8 +65,9 @@ typedef struct {
   const hmpc_real *weight; /* factors on the states' weights, HMPC_N + 1 rows of HMPC_NX */
   const hmpc_real *u_min;  /* tighter limits of the inputs, HMPC_NU */
   const hmpc_real *u_max;
-  const hmpc_real *w;      /* forecast of the measured disturbances, rows of HMPC_NW; a value that is not finite repeats
-                              the row before (in the first row the measured value). NULL: the measured values hold */
+  const hmpc_real *w;      /* forecast of the measured disturbances, rows of HMPC_MEASURED; a value that is not finite
+                              repeats the row before (in the first row the measured value). NULL: the measured values
+                              hold */
   int w_rows;
 } hmpc_goal;
 
@@ -242,7 +245,8 @@ typedef struct {
   hmpc_status status;   /* result of the last solve */
   hmpc_source source;   /* source of u */
   int age;              /* periods since the last successful solve */
-  hmpc_real x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)]; /* the estimate */
+  hmpc_real x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)]; /* the estimate;
+      the last HMPC_TRACKED entries of w are the tracked parameters [their units] */
   hmpc_plan plan;
   hmpc_steady steady; /* if outputs have weights: steady state for the first row of their reference */
 #if HMPC_MONITOR
@@ -281,8 +285,9 @@ typedef struct {
 
 #if HMPC_MODES > 0
 /* hmpc_start: first estimate, first plan (slower than a step), first input. hmpc_step: estimate and decision of one
-   period. y: outputs; a non-finite value is a missing sample; periodic ones may be wrapped. w: measured disturbances; NULL or not finite: the last
-   values. applied: input that acted until now; NULL: the operating point's input, in hmpc_step the last decision. */
+   period. y: outputs; a non-finite value is a missing sample; periodic ones may be wrapped. w: measured disturbances,
+   HMPC_MEASURED; NULL or not finite: the last values. applied: input that acted until now; NULL: the operating point's
+   input, in hmpc_step the last decision. */
 void hmpc_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
 void hmpc_step(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
 /* Runs the monitor, determines the guard's next mode, and prepares the part of the next step that needs no sample.
@@ -295,7 +300,7 @@ void hmpc_watch_begin(hmpc_state *s);
 void hmpc_watch(hmpc_state *s, const hmpc_real *y, const hmpc_real *u_prev);
 #endif
 
-/* The estimator alone: s->x, h, d, w. */
+/* The estimator alone: s->x, h, d, w, with tracked parameters as the last of w. */
 void hmpc_estimate_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w);
 void hmpc_estimate_update(hmpc_state *s, const hmpc_real *y, const hmpc_real *u_prev, const hmpc_real *w);
 #endif

@@ -1,4 +1,8 @@
-/* Kalman filters of state, hidden state and unmeasured disturbances, one for each mode, with the modes' probabilities.
+/* Kalman filters of state, hidden state, tracked parameters and unmeasured disturbances, one for each mode, with the
+   modes' probabilities.
+
+   A tracked parameter is a slow state theta, its deviation from the fitted value; for everything behind the filters its
+   value is one of the last measured disturbances, s->w[HMPC_MEASURED] and following.
 
    Source: Simon, Optimal State Estimation, 2006, section 13.2; Blom and Bar-Shalom, IEEE T-AC 33 (1988). */
 #include "hmpc_math.h"
@@ -24,7 +28,7 @@ static real nearest_turn(real value, real to, real period) {
 
 static void known_w(hmpc_state *s, const real *w, int first) {
 #if HMPC_NW > 0
-  for (int i = 0; i < HMPC_NW && w; ++i)
+  for (int i = 0; i < HMPC_MEASURED && w; ++i)
     if (hmpc_finite(w[i])) {
 #if HMPC_TURNS
       s->w[i] = first ? w[i] : nearest_turn(w[i], s->w[i], w_period[i]);
@@ -50,7 +54,7 @@ static void measured(const real *z, const real *u, const real *w, real *y, real 
   real v[HMPC_NU];
   for (int i = 0; i < HMPC_NU; ++i) {
     v[i] = u[i];
-    for (int j = 0; j < HMPC_ND; ++j) v[i] += disturbs_u[i][j] * z[HMPC_NZ + j];
+    for (int j = 0; j < HMPC_ND; ++j) v[i] += disturbs_u[i][j] * z[HMPC_AT_D + j];
   }
   memset(slope, 0, sizeof(real) * HMPC_NY * HMPC_NE);
 #if HMPC_CURVED
@@ -59,19 +63,19 @@ static void measured(const real *z, const real *u, const real *w, real *y, real 
   for (int i = 0; i < HMPC_NY; ++i) {
     memcpy(slope[i], by_x[i], sizeof by_x[i]);
     for (int j = 0; j < HMPC_ND; ++j) {
-      slope[i][HMPC_NZ + j] = disturbs_y[i][j];
-      for (int k = 0; k < HMPC_NU; ++k) slope[i][HMPC_NZ + j] += by_u[i][k] * disturbs_u[k][j];
+      slope[i][HMPC_AT_D + j] = disturbs_y[i][j];
+      for (int k = 0; k < HMPC_NU; ++k) slope[i][HMPC_AT_D + j] += by_u[i][k] * disturbs_u[k][j];
     }
   }
 #else
   outputs(z, v, w, y);
   for (int i = 0; i < HMPC_NY; ++i) {
     memcpy(slope[i], output_x[i], sizeof output_x[i]);
-    for (int j = 0; j < HMPC_ND; ++j) slope[i][HMPC_NZ + j] = output_d[i][j];
+    for (int j = 0; j < HMPC_ND; ++j) slope[i][HMPC_AT_D + j] = output_d[i][j];
   }
 #endif
   for (int i = 0; i < HMPC_NY; ++i)
-    for (int j = 0; j < HMPC_ND; ++j) y[i] += disturbs_y[i][j] * z[HMPC_NZ + j];
+    for (int j = 0; j < HMPC_ND; ++j) y[i] += disturbs_y[i][j] * z[HMPC_AT_D + j];
 }
 
 /* Gaussian with the mean and covariance of a mixture. */
@@ -94,7 +98,11 @@ static void together(hmpc_state *s, const real *share) {
   for (int m = 0; m < HMPC_MODES; ++m) hmpc_add(z, share[m], s->filter[m].z, HMPC_NE);
   memcpy(s->x, z, sizeof s->x);
   if (HMPC_NH > 0) memcpy(s->h, z + HMPC_NX, sizeof s->h);
-  if (HMPC_ND > 0) memcpy(s->d, z + HMPC_NZ, sizeof s->d);
+  if (HMPC_ND > 0) memcpy(s->d, z + HMPC_AT_D, sizeof s->d);
+#if HMPC_TRACKED > 0
+  real by_theta[HMPC_TRACKED];
+  tracked_values(z + HMPC_NZ, s->w + HMPC_MEASURED, by_theta);
+#endif
 }
 
 /* Least-squares step x of rows x = error with the smallest norm. Rotations make the rows orthogonal and also rotate the
@@ -214,7 +222,7 @@ static void start_fitting(const real *y, const real *w, int mode, real *x) {
   }
 }
 
-/* (x, h, d) at rest: the state that fits the outputs, and the hidden state after a simulation at rest. */
+/* (x, h, theta, d) at rest: the state that fits the outputs, and the hidden state after a simulation at rest. */
 static void start_at(const hmpc_state *s, const real *y, int mode, real *z) {
   real z_next[HMPC_LZ] = {R(0.0)};
   memset(z, 0, sizeof(real) * HMPC_LE);
@@ -235,6 +243,7 @@ static void start_at(const hmpc_state *s, const real *y, int mode, real *z) {
 void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
   real z[HMPC_LE];
   known_w(s, w, 1);
+  for (int i = HMPC_MEASURED; i < HMPC_NW; ++i) s->w[i] = w_rest[i]; /* the fitted values, theta = 0 */
 #if HMPC_TURNS
   memcpy(s->y, y, sizeof s->y);
 #endif
@@ -252,22 +261,33 @@ void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
 /* Prediction over one period with the input held. */
 static void predict(hmpc_state *s, const hmpc_filter *from, const real *u, int mode, hmpc_filter *to) {
   real v[HMPC_NU], next[HMPC_LZ] = {R(0.0)};
-  const real *const d = from->z + HMPC_NZ;
+  const real *const d = from->z + HMPC_AT_D;
+#if HMPC_TRACKED > 0
+  real w[HMPC_NW], by_theta[HMPC_TRACKED]; /* with this mode's parameters, and their derivatives */
+  memcpy(w, s->w, sizeof w);
+  tracked_values(from->z + HMPC_NZ, w + HMPC_MEASURED, by_theta);
+#else
+  const real *const w = s->w;
+#endif
   for (int i = 0; i < HMPC_NU; ++i) {
     v[i] = u[i];
     for (int j = 0; j < HMPC_ND; ++j) v[i] += disturbs_u[i][j] * d[j];
   }
-  hmpc_model_slope(from->z, v, s->w, next, s->stage[0]);
+  hmpc_model_slope(from->z, v, w, next, s->stage[0]);
   for (int i = 0; i < HMPC_NZ; ++i) {
     memcpy(s->transition[i], s->stage[i], sizeof(real) * HMPC_NZ);
     for (int j = 0; j < HMPC_ND; ++j) {
       real slope = i < HMPC_NX ? disturbs_x[i < HMPC_NX ? i : 0][j] : R(0.0);
       for (int k = 0; k < HMPC_NU; ++k) slope += s->stage[i][HMPC_LZ + k] * disturbs_u[k][j];
-      s->transition[i][HMPC_NZ + j] = slope;
+      s->transition[i][HMPC_AT_D + j] = slope;
       if (i < HMPC_NX) next[i] += disturbs_x[i < HMPC_NX ? i : 0][j] * d[j];
     }
+#if HMPC_TRACKED > 0
+    for (int j = 0; j < HMPC_TRACKED; ++j)
+      s->transition[i][HMPC_NZ + j] = s->stage[i][HMPC_LZ + HMPC_NU + j] * by_theta[j];
+#endif
   }
-  for (int i = HMPC_NZ; i < HMPC_NE; ++i) s->transition[i][i] = R(1.0);
+  for (int i = HMPC_NZ; i < HMPC_NE; ++i) s->transition[i][i] = decay[i - HMPC_NZ]; /* 1 for d */
   hmpc_multiply(s->transition[0], HMPC_LE, from->p[0], s->product[0], HMPC_NE, HMPC_NE, HMPC_NE, HMPC_LE);
   for (int i = 0; i < HMPC_NE; ++i)
     for (int j = 0; j < i; ++j) {
@@ -278,7 +298,7 @@ static void predict(hmpc_state *s, const hmpc_filter *from, const real *u, int m
   hmpc_multiply(s->transition[0], HMPC_LE, s->product[0], to->p[0], HMPC_NE, HMPC_NE, HMPC_NE, HMPC_LE);
   for (int i = 0; i < HMPC_NE; ++i) {
     to->p[i][i] += noise[mode][i];
-    to->z[i] = i < HMPC_NZ ? next[i < HMPC_NZ ? i : 0] : from->z[i];
+    to->z[i] = i < HMPC_NZ ? next[i < HMPC_NZ ? i : 0] : s->transition[i][i] * from->z[i];
   }
 }
 

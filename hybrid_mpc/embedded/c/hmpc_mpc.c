@@ -44,6 +44,7 @@ void hmpc_run_free(hmpc_state *s, const real *u, int rows) {
     hmpc_model(plan->z[k], v, plan->w[k], plan->z[k + 1]);
     disturb_state(plan->d, plan->z[k + 1]);
     fine &= hmpc_all_finite(plan->z[k + 1], HMPC_NZ);
+    for (int i = 0; i < HMPC_NX; ++i) fine &= plan->z[k + 1][i] >= x_usable[0][i] && plan->z[k + 1][i] <= x_usable[1][i];
   }
   for (int k = 0; k < HMPC_N && !fine; ++k) memcpy(plan->z[k + 1], plan->z[0], sizeof plan->z[0]);
   plan->cost = R(NAN);
@@ -570,8 +571,8 @@ static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows
     if (w) {
       memcpy(now, row_of(w, w_rows, k, HMPC_NW), sizeof now);
     } else if (k > 0 && goal && goal->w && goal->w_rows > 0) {
-      const real *const ahead = row_of(goal->w, goal->w_rows, k, HMPC_NW);
-      for (int i = 0; i < HMPC_NW; ++i)
+      const real *const ahead = row_of(goal->w, goal->w_rows, k, HMPC_MEASURED);
+      for (int i = 0; i < HMPC_MEASURED; ++i)
         if (hmpc_finite(ahead[i])) now[i] = ahead[i];
     }
     other |= memcmp(linear->w[k], now, sizeof now) != 0;

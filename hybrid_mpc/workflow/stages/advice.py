@@ -9,7 +9,7 @@ from hybrid_mpc.compare.sequential import hardest
 from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Hint
-from hybrid_mpc.rules import counted
+from hybrid_mpc.rules import counted, time_text
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.compare import REPORTED, closed_loops
 from hybrid_mpc.workflow.stages.promises import SEARCH, STRUCTURE
@@ -37,9 +37,9 @@ def advice(results: Results, *, explained: bool = False, declared: Sequence[floa
         ``[hint.finding for hint in advice(read_results(path)) if hint.verdict == "bad"]``
     """
     found = [
-        *_doubt(results), *_recordings(results), *_prior(results, explained), *_choice(results, explained),
-        *_linear(results), *_floor(results, declared), *_bands(results), *_promises(results), *_loops(results),
-        *_watching(results),
+        *_doubt(results), *_recordings(results), *_prior(results, explained), *_tracked(results),
+        *_choice(results, explained), *_linear(results), *_floor(results, declared), *_bands(results),
+        *_promises(results), *_loops(results), *_watching(results),
     ]  # fmt: skip
     if closed_loops(results.control) is not None and not any(hint.verdict == "bad" for hint in found):
         found.append(
@@ -107,6 +107,11 @@ def _prior(results: Results, explained: bool) -> Iterator[Hint]:
                 "Check signs and units. Look for a missing term, in the sensor equation too. A network can only "
                 "correct small errors." + ("" if explained else f" {SEARCH}"),
             )  # fmt: skip
+
+
+def _tracked(results: Results) -> Iterator[Hint]:
+    for doubt in () if isinstance(results.track, Absent) else results.track.tracking.doubts:
+        yield Hint("bad", f"Tracking: {doubt}.", "Add the missing term, then run again with --track.")
 
 
 def _choice(results: Results, explained: bool) -> Iterator[Hint]:
@@ -210,8 +215,8 @@ def _loops(results: Results) -> Iterator[Hint]:
     ms = None if isinstance(results.control, Absent) else results.control.step_ms
     if ms is not None and ms.p99 > ms.period:
         yield Hint(
-            "bad", f"Controller step time: the 99th percentile is {ms.p99:.3g} ms of wall time, but the period "
-            f"is {ms.period:g} ms.",
+            "bad", f"Controller step time: the 99th percentile is {time_text(ms.p99)} of wall time, but the "
+            f"period is {time_text(ms.period)}.",
             "Measure again on an idle computer. Else use the solver native (compiled C), a shorter horizon or a "
             "longer dt.",
         )  # fmt: skip

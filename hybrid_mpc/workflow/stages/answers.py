@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.plots.style import name_of
 from hybrid_mpc.report.page import Answer, Verdict
-from hybrid_mpc.rules import counted
+from hybrid_mpc.rules import counted, time_text
 from hybrid_mpc.workflow.stage import Absent
 from hybrid_mpc.workflow.stages.advice import EXPLAINED
 from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, closed_loops
@@ -102,11 +102,11 @@ def controller_answer(results: Results) -> Answer:
         return Answer(
             "Is the controller safe?", "bad", f"In doubt: {', '.join(doubted) or 'see below'}", lines
         )
-    on_plant = closed_loops(results.control) is not None
-    if not on_plant and isinstance(results.on_model, Absent):
-        return Answer("Is the controller safe?", "plain", "Not shown: no closed loop was simulated", lines)
-    simulated = "Yes, in simulation" if on_plant else "Yes, on its own model"
-    return Answer("Is the controller safe?", "good", simulated, lines)
+    if closed_loops(results.control) is not None:
+        return Answer("Is the controller safe?", "good", "Yes, in simulation", lines)
+    none = isinstance(results.on_model, Absent)
+    tested = "no closed loop was simulated" if none else "its loops ran on a model, without a plant"
+    return Answer("Is the controller safe?", "plain", f"Not shown: {tested}", lines)
 
 
 def _promise_line(rows: Sequence[Promise], open_: Sequence[Promise]) -> str:
@@ -144,8 +144,8 @@ def _time_lines(found: ControlResult | Absent) -> Iterator[tuple[str, bool]]:
     where = "of the tasks' loops" if found.rows else "on recordings"
     late = f"{counted(ms.misses, 'step')} missed the deadline" if ms.misses else "No step missed its deadline"
     yield (
-        f"{late}: 99 % of the steps {where} take less than {ms.p99:.3g} ms of wall time; the period is "
-        f"{ms.period:g} ms.",
+        f"{late}: 99 % of the steps {where} take less than {time_text(ms.p99)} of wall time; the period is "
+        f"{time_text(ms.period)}.",
         ms.misses > 0,
     )
 

@@ -31,6 +31,7 @@ from hybrid_mpc.identify.evaluate import (
 )
 from hybrid_mpc.identify.fit import beyond_ranges, fit_prior, smoothed
 from hybrid_mpc.identify.linear import BASELINES, LinearModel
+from hybrid_mpc.identify.own_fits import fit_each
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
@@ -342,9 +343,14 @@ def examined_prior(context: Context) -> PriorResult:
         )
         context.progress.warn(growth[0])
     worse = warn_of_worse_outputs(errors["phy_nominal"].rmse, errors["phy"].rmse)
-    for warning in worse:
+    length = longest_run or longest or trial
+    context.progress.update("free runs", 1, 1, "fitting each recording alone")
+    known_late = spec.largest_delay > 0 or any("HM-IDENTIFY-080" in one for one in fit.warnings)
+    alone = fit_each(make, fit, [*train, *valid], dt=spec.dt, length=length, delay=not known_late)
+    differ = () if alone is None else alone.warnings
+    for warning in (*worse, *differ):
         context.progress.warn(f"fit of the prior: {warning}")
-    fit = replace(fit, warnings=(*fit.warnings, *growth, *worse))
+    fit = replace(fit, warnings=(*fit.warnings, *growth, *worse, *differ))
     own = {name: one.error for name, one in errors.items()} | {"constant": _error_of(baselines["constant"])}
     training: dict[str, float] = {}
     if own["phy"] >= own["constant"]:
@@ -355,7 +361,6 @@ def examined_prior(context: Context) -> PriorResult:
     compared = baselines if not growth else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
     acting, unit = shifted(train, fit.delay), context.time_unit
-    length = longest_run or longest or trial
     context.progress.update("free runs", 1, 1, "looking for wrong terms")
     off = zip(errors["phy"].rmse.items(), smoother.sizes.y, strict=True)
     wrong = named(causes(make, fit.values, acting, spec.dt, length, unit))

@@ -52,16 +52,12 @@ def track_stage(context: Context) -> TrackResult | Absent:
         (len(t.t) * spec.dt - spec.warm_up for t in (*valid, *context.trajectories("test"))), default=None
     )
     length = context.prior.longest_run or spec.free_run or longest or spec.dt * scenario.control.horizon
-    return TrackResult(
-        *find_tracked(
-            scenario,
-            context.prior.fit,
-            train,
-            valid,
-            length=length,
-            horizon=scenario.control.horizon * spec.dt,
-        )
+    found = find_tracked(
+        scenario, context.prior.fit, train, valid, length=length, horizon=scenario.control.horizon * spec.dt
     )
+    for doubt in found[1].doubts:
+        context.progress.warn(doubt)
+    return TrackResult(*found)
 
 
 TRACK = Stage(
