@@ -108,9 +108,9 @@ def nearest_turn(values: ArrayLike, to: ArrayLike, period: ArrayLike) -> NDArray
         >>> nearest_turn([1.0, 5.0], [359.0, 359.0], [360.0, math.inf]).tolist()
         [361.0, 5.0]
     """
-    moved, whole = np.asarray(values, dtype=np.float64), np.asarray(period, dtype=np.float64)
+    moved, near, whole = (np.asarray(v, dtype=np.float64) for v in (values, to, period))
     with np.errstate(over="ignore", invalid="ignore"):
-        turns = np.rint((moved - to) / whole)
+        turns = np.rint((moved - near) / whole)
         return np.where(np.isfinite(turns) & (turns != 0.0), moved - turns * whole, moved)
 
 

@@ -52,7 +52,8 @@ def test_wrapped_samples_give_the_estimates_of_unwrapped_ones(kind):
     plain, found = along(observer, y, u, wind), along(observer, folded, u, wrapped(wind))
     assert plain[0].x[0] == pytest.approx(folded[0, 0])  # the start is as measured
     for a, b in zip(plain, found, strict=True):
-        assert np.allclose(a.x, b.x, rtol=0, atol=ROUNDING) and np.allclose(a.d, b.d, rtol=0, atol=ROUNDING)
+        assert np.allclose(a.x, b.x, rtol=0, atol=ROUNDING)
+        assert np.allclose(a.d, b.d, rtol=0, atol=ROUNDING)
         assert np.allclose(a.innovation, b.innovation, rtol=0, atol=ROUNDING, equal_nan=True)
         assert np.allclose(a.w, b.w, rtol=0, atol=ROUNDING)
 
@@ -74,12 +75,15 @@ def test_the_period_is_that_of_the_unit():
         "turn": 1.0,
         "mrad": pytest.approx(2000 * math.pi),
     }
-    assert Signal("a", "rad", periodic=True).radians == 1.0 and Signal("a", "m").period == math.inf
+    assert Signal("a", "rad", periodic=True).radians == 1.0
+    assert Signal("a", "m").period == math.inf
     for unit in ("m", "-", "furlong", "rad/s"):
         with pytest.raises(InputError, match="HM-MACHINE-047"):
             Signal("a", unit, periodic=True)
     half = nearest_turn([180.0, 181.0, math.nan, math.inf], np.zeros(4), np.full(4, 360.0))
-    assert half[:2].tolist() == [180.0, -179.0] and np.isnan(half[2]) and half[3] == math.inf
+    assert half[:2].tolist() == [180.0, -179.0]
+    assert np.isnan(half[2])
+    assert half[3] == math.inf
 
 
 def closed_loop(folded: bool, **options: object) -> tuple[np.ndarray, np.ndarray, Loop]:
@@ -104,8 +108,10 @@ def course(t: np.ndarray) -> np.ndarray:
 def test_a_loop_with_a_compass_does_not_turn_a_circle():
     plain, u, _ = closed_loop(False, reference=course)
     found, v, loop = closed_loop(True, reference=course)
-    assert np.allclose(plain, found, rtol=0, atol=1e-6) and np.allclose(u, v, rtol=0, atol=1e-6)
-    assert plain.max() < 400.0 and plain[-1] == pytest.approx(380.0, abs=1.0)
+    assert np.allclose(plain, found, rtol=0, atol=1e-6)
+    assert np.allclose(u, v, rtol=0, atol=1e-6)
+    assert plain.max() < 400.0
+    assert plain[-1] == pytest.approx(380.0, abs=1.0)
     assert loop.state.y[0] == pytest.approx(380.0, abs=1.0)  # what the monitor reads has no jumps
 
 
