@@ -8,9 +8,10 @@ import pytest
 import torch
 from wrapped_machine import DEG, boat
 
-from hybrid_mpc import HybridStep, Prior, Scaling, Signal, StackedGRU, n_features
+from hybrid_mpc import HybridStep, Prior, Scaling, Signal, n_features
 from hybrid_mpc.analyze.analysis import state_range
 from hybrid_mpc.analyze.equilibria import equilibria
+from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.identify.prior_replay import _Places
 
 
@@ -62,14 +63,6 @@ def test_a_network_sees_the_angle_and_not_its_unit(unit):
     assert seen.shape[-1] == n_features(own.prior, True) == 2 + 1 + 1 + 1 + 2 + 1
     torch.testing.assert_close(seen, radians.features(*drawn("rad")), rtol=0, atol=1e-12)
     torch.testing.assert_close(seen, own.features(*drawn(unit, turns=3.0)), rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize("unit", ["deg", "rad"])
-def test_free_runs_on_the_cpu_see_the_same_features(unit):
-    own, (x, u, w) = step_of(unit), drawn(unit)
-    features = own._rollout.features
-    found = np.array([features(*(v[k].numpy() for v in (x, u, w)), []).full().ravel() for k in range(len(x))])
-    np.testing.assert_allclose(found, own.features(x, u, w).reshape(found.shape), rtol=0, atol=1e-12)
 
 
 def test_distances_of_prior_replay_are_those_of_angles():
