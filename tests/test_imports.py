@@ -26,7 +26,7 @@ ROOMS = {
     "model": "nn_export errors rules records machine",
     "estimate": "errors rules records machine model",
     "control": "nn_export errors rules records model estimate",
-    "loop": "errors rules records model estimate control",
+    "loop": "errors rules records machine model estimate control",
     "scenario": "errors rules records machine model control loop",
     "watch": "errors rules machine data model",
     "embedded": "nn_export errors rules files model estimate control loop watch",

@@ -281,7 +281,9 @@ def state_range(model: HybridModel, control: OCP | None = None) -> Array:
     none = np.full(model.n_x, np.inf)
     lower, upper = (-none, none) if control is None else control.state_range
     sides = zip(model.states, lower.tolist(), upper.tolist(), model.x0.tolist(), strict=True)
-    return np.array([_within(s, np.pi if s.periodic else 1.0, low, high, at) for s, low, high, at in sides])
+    return np.array(
+        [_within(s, s.period / 2 if s.periodic else 1.0, low, high, at) for s, low, high, at in sides]
+    )
 
 
 def input_range(model: HybridModel, control: OCP | None) -> Array:

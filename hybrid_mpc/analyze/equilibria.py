@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import nearest_turn
 from hybrid_mpc.model.equilibrium import (
     RESIDUAL,
     hidden_fixed_point,
@@ -163,12 +164,11 @@ def _move_by_turns(model: HybridModel, z: Array, box: Array) -> Array:
     turned = z.copy()
     for i, signal in enumerate(model.states):
         if signal.periodic and np.isfinite(z[i]):
-            turned[i] = box[i, 0] + (z[i] - box[i, 0]) % (2 * np.pi)
+            turned[i] = box[i, 0] + (z[i] - box[i, 0]) % signal.period
     return turned
 
 
 def _apart(model: HybridModel, difference: Array) -> Array:
     """Absolute difference of states ``(n_x,)``; periodic states modulo a turn."""
-    turns = np.array([s.periodic for s in model.states])
-    around = np.abs((difference + np.pi) % (2 * np.pi) - np.pi)
-    return np.where(turns, around, np.abs(difference))
+    turn = np.array([s.period for s in model.states])
+    return np.abs(nearest_turn(difference, np.zeros(model.n_x), turn))

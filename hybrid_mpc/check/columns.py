@@ -69,6 +69,17 @@ class Column:
         return tuple(np.split(self.values, np.cumsum(self.lengths)[:-1]))
 
     @property
+    def parts(self) -> tuple[Column, ...]:
+        """Columns that a linear model may take: the sine and cosine of a periodic one, else the column itself."""
+        if not self.periodic:
+            return (self,)
+        angle = self.signal.radians * self.values
+        return tuple(
+            replace(self, name=f"{key}_{self.name}", unit="", values=f(angle), periodic=False)
+            for key, f in (("sin", np.sin), ("cos", np.cos))
+        )
+
+    @property
     def span(self) -> tuple[float, float]:
         """Smallest and largest number."""
         return float(np.nanmin(self.values)), float(np.nanmax(self.values))

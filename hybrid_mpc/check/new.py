@@ -16,7 +16,6 @@ from hybrid_mpc.check.first_model import CLOSED, Lag, Runs, feedback_of, first_l
 from hybrid_mpc.check.roles import Kind, Trait, Verdict, driven, judge_roles
 from hybrid_mpc.data.excitation import check_excitation
 from hybrid_mpc.data.files import opened
-from hybrid_mpc.data.names import ANGLES
 from hybrid_mpc.data.recording import MIN_SCORED, read_recordings
 from hybrid_mpc.data.scales import noise_of, robust_spread
 from hybrid_mpc.data.source import Source, name_and_unit
@@ -25,7 +24,7 @@ from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_text
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
-from hybrid_mpc.machine.units import per_second
+from hybrid_mpc.machine.units import per_second, turn_in
 from hybrid_mpc.records import shown
 from hybrid_mpc.rules import LARGEST
 
@@ -97,11 +96,11 @@ class Draft:
 
     @property
     def runs(self) -> tuple[Runs, ...]:
-        """Outputs, and all inputs and disturbances, of each recording, at the longest sampling period of all.
+        """Outputs and :attr:`effects` of each recording, at the longest sampling period of all.
 
         A recording that is sampled faster has the inputs' means until the next sample.
         """
-        y, u = (list(zip(*(c.pieces for c in group), strict=True)) for group in (self.outputs, self.drives))
+        y, u = (list(zip(*(c.pieces for c in group), strict=True)) for group in (self.outputs, self.effects))
         runs = [Runs(np.column_stack(a), np.column_stack(b)) for a, b in zip(y, u, strict=True)]
         periods = self.periods or (self.period,) * len(runs)
         return tuple(_thinned(run, round(self.period / p)) for run, p in zip(runs, periods, strict=True))
@@ -131,6 +130,11 @@ class Draft:
     def drives(self) -> tuple[Column, ...]:
         """All inputs and disturbances."""
         return (*self.inputs, *self.disturbances)
+
+    @property
+    def effects(self) -> tuple[Column, ...]:
+        """What the first prior is linear in: inputs and disturbances, of a periodic one its sine and cosine."""
+        return (*self.inputs, *(own for c in self.disturbances for own in c.parts))
 
     @property
     def signals(self) -> tuple[Column, ...]:
@@ -374,22 +378,27 @@ def _in_loop(draft: Draft) -> Draft:
 
 def _unwrap(paths: Sequence[Path], draft: Draft) -> Draft:
     """The draft with wrapped angles unwrapped; checks that the recordings can be read with it."""
-    trial = replace(draft, outputs=tuple(replace(c, periodic=c.unit in ANGLES) for c in draft.outputs))
+    groups = (draft.outputs, draft.disturbances)
+    outputs, others = (
+        tuple(replace(c, periodic=turn_in(c.unit) is not None) for c in group) for group in groups
+    )
+    trial = replace(draft, outputs=outputs, disturbances=others)
     recordings, problems = read_recordings(
         paths, Roles.of(trial), trial.data(SMOOTHED * draft.period, 2 * draft.period)
     )
     refuse(problems)
     wrapped = {finding.channel for one in recordings for finding in one.findings if finding.kind == "wrapped"}
-    values = np.concatenate([one.y for one in recordings]).T
-    return replace(
-        draft,
-        outputs=tuple(
-            replace(c, periodic=True, values=own, lengths=tuple(len(one.y) for one in recordings))
-            if c.full in wrapped
-            else c
-            for c, own in zip(draft.outputs, values, strict=True)
-        ),
+    lengths = tuple(len(one.y) for one in recordings)
+    outputs, others = (
+        tuple(
+            replace(c, periodic=True, values=own, lengths=lengths) if c.full in wrapped else c
+            for c, own in zip(group, np.concatenate(values).T, strict=True)
+        )
+        for group, values in zip(
+            groups, ([one.y for one in recordings], [one.w for one in recordings]), strict=True
+        )
     )
+    return replace(draft, outputs=outputs, disturbances=others)
 
 
 def _at_rest(paths: Sequence[Path], draft: Draft) -> list[str]:
@@ -486,7 +495,11 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
     """
     y_names = _names(draft.outputs, set())
     u_names, w_names = _names(draft.inputs, set()), _names(draft.disturbances, set())
-    drives = [*(("u", n) for n in u_names), *(("w", n) for n in w_names)]
+    drives = [(f"u.{n}", n) for n in u_names]  # expressions of the effects, and names
+    for name, column in zip(w_names, draft.disturbances, strict=True):
+        angle = f"w.{name}" if column.signal.radians == 1 else f"{column.signal.radians!r} * w.{name}"
+        turned = [(f"{key}({angle})", f"{key}_{name}") for key in ("sin", "cos")]
+        drives += turned if column.periodic else [(f"w.{name}", name)]
     lags = draft.lags
     kind = "".join(part.capitalize() for part in ascii_of(path.stem).split("_")) or "Machine"
     kind = f"Machine{kind}" if kind[0].isdigit() or keyword.iskeyword(kind) or kind in USED else kind
@@ -512,7 +525,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         low, high = column.span[0] - span, column.span[1] + span
         # the effect of the drives at their medians; what remains of the output may lie far outside its recorded range
         made = sum(
-            gain * float(np.nanmedian(c.values)) for gain, c in zip(lag.gains, draft.drives, strict=True)
+            gain * float(np.nanmedian(c.values)) for gain, c in zip(lag.gains, draft.effects, strict=True)
         )
         middle = min(max(lag.offset + made, low), high) - made
         low, high = min(low, low - made, middle), max(high, high - made, middle)
@@ -522,7 +535,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
             inner = lag.seconds if lag.states == 1 else 2 * lag.damping * lag.seconds
             pull = (lag.offset - float(np.nanmedian(column.values))) / inner
             pushes = [gain / inner for gain in lag.gains]
-            sizes = [float(np.ptp(c.span)) for c in draft.drives]
+            sizes = [float(np.ptp(c.span)) for c in draft.effects]
             most = 10 * max(
                 abs(pull), span / draft.length, *(abs(k * s) for k, s in zip(pushes, sizes, strict=True))
             )
@@ -534,12 +547,12 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
             written = [drift]
             offsets.append(parameters[-1][1])
             gains.append([])
-            for (kind_of, drive), source, push, size in zip(drives, draft.drives, pushes, sizes, strict=True):
+            for (acts, drive), source, push, size in zip(drives, draft.effects, pushes, sizes, strict=True):
                 per, reach = f"{unit}/({source.unit or '-'})", float(_rounded(min(most / size, LARGEST)))
                 k = parameter(
                     f"k_{name}_{drive}", float(_rounded(push, 4)), per, -reach, reach, f"rate per {drive}"
                 )
-                written.append(f"{k} * {kind_of}.{drive}")
+                written.append(f"{k} * {acts}")
                 gains[-1].append(parameters[-1][1])
             steady.append(f"{name}_moves = {' + '.join(written)}")
             if lag.states == 1:
@@ -561,13 +574,13 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         towards = [parameter(f"rest_{name}", middle, unit, low, high, "value without inputs")]
         offsets.append(parameters[-1][1])
         gains.append([])
-        for (kind_of, drive), source, gain in zip(drives, draft.drives, lag.gains, strict=True):
+        for (acts, drive), source, gain in zip(drives, draft.effects, lag.gains, strict=True):
             reach = float(_rounded(min(10 * max(abs(gain), span / float(np.ptp(source.span))), LARGEST)))
             per = f"{unit}/({source.unit})" if source.unit and source.unit != "-" else unit
             # rounded such that the output at the largest input stays the same
             value = float(near(gain, span / 500 / max(map(abs, source.span)))) or float(_rounded(gain))
             towards.append(
-                f"{parameter(f'k_{name}_{drive}', value, per, -reach, reach, f'gain from {drive}')} * {kind_of}.{drive}"
+                f"{parameter(f'k_{name}_{drive}', value, per, -reach, reach, f'gain from {drive}')} * {acts}"
             )
             gains[-1].append(parameters[-1][1])
         steady.append(f"{name}_steady = {' + '.join(towards)}")
@@ -607,6 +620,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
             f"Lines marked {MARK} are for you to decide."
         ),
         "",
+        *(["from casadi import cos, sin", ""] if any(c.periodic for c in draft.disturbances) else []),
         "from hybrid_mpc import OCP, DataSpec, OperatingPoint, Parameter, Prior, Scenario, Signal",
         "",
         "",
@@ -692,20 +706,36 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
 
 def _first_rest(draft: Draft, gains: Array, offsets: Array) -> tuple[list[float], list[float], list[float]]:
     """Outputs, inputs and disturbances at a steady state of the lags, as close as possible to the recorded medians."""
-    n_u = len(draft.inputs)
-    y, drives = (np.array([np.nanmedian(c.values) for c in cs]) for cs in (draft.outputs, draft.drives))
+    n_u, w0 = len(draft.inputs), [_middle(c) for c in draft.disturbances]
+    y, u0 = (np.array([np.nanmedian(c.values) for c in cs]) for cs in (draft.outputs, draft.inputs))
+    at_w0 = [
+        float(part.values[0])
+        for value, c in zip(w0, draft.disturbances, strict=True)
+        for part in replace(c, values=np.array([value])).parts
+    ]
+    drives = np.concatenate([u0, at_w0])
     moves = np.array([lag.integrates(draft.length) for lag in draft.lags])  # steady where the rate is zero
     missing = np.where(moves, 0.0, y) - offsets - gains @ drives
-    sizes = np.array([np.ptp(c.span) for c in (*draft.outputs, *draft.drives)])
+    sizes = np.array([np.ptp(c.span) for c in (*draft.outputs, *draft.effects)])
     per_y, per_u = sizes[: len(y)], sizes[len(y) : len(y) + n_u]
     per_y = np.where(moves, np.abs(gains[:, :n_u]) @ per_u, per_y)
     # scaled by the recorded spans: independent of units
     drives[:n_u] += per_u * (np.linalg.pinv(gains[:, :n_u] * per_u / per_y[:, None]) @ (missing / per_y))
-    held = [
-        float(near(min(max(v, c.span[0]), c.span[1]), np.ptp(c.span) / 500))
-        for v, c in zip(drives, draft.drives, strict=True)
-    ]
-    return np.where(moves, y, offsets + gains @ np.array(held)).tolist(), held[:n_u], held[n_u:]
+    held = [_within(v, c) for v, c in zip(drives, draft.inputs, strict=False)]
+    y = np.where(moves, [_middle(c) for c in draft.outputs], offsets + gains @ np.array([*held, *at_w0]))
+    return y.tolist(), held, w0
+
+
+def _within(value: float, column: Column) -> float:
+    """A value within the recorded range, rounded."""
+    low, high = column.span
+    return float(near(min(max(value, low), high), (high - low) / 500))
+
+
+def _middle(column: Column) -> float:
+    """Median of a column, within the first turn of an angle that was unwrapped."""
+    middle = float(np.nanmedian(column.values))
+    return round(middle % column.signal.period, 6) if column.periodic else _within(middle, column)
 
 
 def horizon_of(draft: Draft) -> tuple[int, str]:

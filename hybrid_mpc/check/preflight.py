@@ -33,6 +33,7 @@ from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
 from hybrid_mpc.machine.terms import EXPLANATIONS
+from hybrid_mpc.machine.units import turn_in
 from hybrid_mpc.model.equilibrium import Range, RateEquations, rate_search
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import known
@@ -226,9 +227,9 @@ def warn_of_drift(prior: Prior, second: float) -> tuple[str, ...]:
 def _equilibria(prior: Prior, model: HybridModel, x: Array, u: Array) -> tuple[Equilibrium, ...]:
     region = []
     for signal, near in zip(prior.states, x, strict=True):
-        turn = signal.unit == "rad"
-        reach = math.pi if turn else 10.0 * max(1.0, abs(near))
-        low, high = (-math.inf, math.inf) if signal.periodic and turn else (signal.lower, signal.upper)
+        turn = turn_in(signal.unit)
+        reach = 10.0 * max(1.0, abs(near)) if turn is None else turn / 2
+        low, high = (-math.inf, math.inf) if signal.periodic else (signal.lower, signal.upper)
         region.append(
             (low if math.isfinite(low) else near - reach, high if math.isfinite(high) else near + reach)
         )

@@ -26,7 +26,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.names import ANGLES, DRIVING_UNITS, REACHED_UNITS, Role, is_command_of, role_said_by
+from hybrid_mpc.data.names import DRIVING_UNITS, REACHED_UNITS, Role, is_command_of, role_said_by
+from hybrid_mpc.machine.units import turn_in
 
 Array = NDArray[np.float64]
 Kind = Literal["input", "output", "set-point", "disturbance", "none"]
@@ -554,7 +555,7 @@ class _Judge:
                 self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
                 continue
             # a column that no input affects is no output of the machine; angles belong to the machine in any case
-            free = trait.unit not in ANGLES and all(self.links.of(t, trait) < QUIET for t in inputs)
+            free = turn_in(trait.unit) is None and all(self.links.of(t, trait) < QUIET for t in inputs)
             free = free and not any(is_rate(trait, t) or is_rate(t, trait) for t in outputs)
             moved = [t for t in outputs if self.links.of(trait, t, beside=inputs) >= ACTS] if free else []
             back = max((self.links.of(t, trait) for t in moved), default=0.0)

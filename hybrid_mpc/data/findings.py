@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.machine.specification import DataSpec
-from hybrid_mpc.machine.units import Conversion, conversion
+from hybrid_mpc.machine.units import turn_in
 from hybrid_mpc.rules import counted
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ class Channel:
         """
         found, signal, angle, t = list[Finding](), self.signal, None, self.t
         again = "Record an angle without jumps, or unwrap it first: numpy.unwrap(..., period="
-        if (turn := turn_of(signal)) is not None:
+        if (turn := turn_in(signal.unit)) is not None:
             angle = unwrap(t, self.y, turn, max_gap, periodic=signal.periodic)
             if len(angle.jumps):
                 told = (
@@ -158,10 +158,7 @@ class Channel:
                     f"for {signal.name} in the prior to unwrap it, or record an angle without jumps."
                 )
                 if signal.periodic:
-                    told = (
-                        f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped. An estimator or "
-                        "monitor that runs on the sensor itself needs an angle without jumps, too."
-                    )
+                    told = f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped."
                 if signal.periodic and len(angle.unclear):
                     told += (
                         f" Before {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} s) too many samples "
@@ -335,13 +332,6 @@ def _jumping(channel: Channel, jumps: Indices, size: str, digits: int, told: str
         f"{y[k]:.{digits}g}{unit} at {channel.t[k]:.6g} s): {told}"
     )
     return channel.finding("wrapped", k, count, message, refused)
-
-
-def turn_of(signal: Signal) -> float | None:
-    """A full turn in the signal's unit; None if the unit is not one of an angle."""
-    found = conversion("rev", signal.unit)
-    angle = isinstance(found, Conversion) and signal.unit not in ("-", "1", "%", "ppm")
-    return found.factor if isinstance(found, Conversion) and angle else None
 
 
 # Stuck sensors, and speeds

@@ -200,8 +200,6 @@ QUANTITY = words_of(  # words for quantities of a machine
     "heading yaw pitch roll theta phi psi alpha beta gamma q dq qd x z omega distance displacement "
     "acceleration acc accel hohe weg pendulum cart room raum raumtemperatur hallentemperatur zulauftemperatur"
 )
-ANGLES = ("rad", "mrad", "deg", "°", "rev", "turn")
-"""Units of a column that may be an angle with jumps by full turns."""
 DRIVING_UNITS = frozenset(  # units of most inputs
     ("V", "mV", "kV", "%", "N m", "Nm", "mNm", "Ncm", "kNm", "N", "kN", "mN", "W", "kW")
 )

@@ -150,6 +150,7 @@ def make_sources(
         "CURVED": int(curved), "STAGE_COST": int(staged), "COST_MOVES": int(staged and cost.n_p > 0),
         "OUTPUT_ROWS": int(ocp.n_y > 0 and not staged), "STARTS": len(ocp.starts),
         "START_MODES": len(modes) if len({(f.first.tobytes(), f.noise[1].tobytes()) for f in modes}) > 1 else 1,
+        "TURNS": int(estimator is not None and any(s.periodic for s in (*model.outputs, *model.disturbances))),
     }  # fmt: skip
     code, model_sizes, operations = _expressions(
         model, parts, soft, fallback, ocp, problem, sizes, watched.code, tracked
@@ -494,6 +495,8 @@ def _tables(
             "decay": np.array([*(one.decay(dt) for one in tracked), *np.ones(model.n_d)]),
             "first_variance": np.array([f.first for f in modes]), "start_size": np.array([f.nearness for f in modes]),
             "lost_variance": np.array([np.where(f.most < np.finfo(float).max, f.most, np.inf) for f in modes]),
+            "y_period": np.array([s.period for s in model.outputs]),
+            "w_period": np.array([s.period for s in model.disturbances]),
             "switches": np.ones((1, 1)) if switching is None else switching.transition,
             "first_probability": np.ones(1) if switching is None else switching.first_probability,
         }  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.machine.signals import nearest_turn
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.limits import sampled, vector
@@ -86,6 +87,9 @@ class ExtendedKalmanFilter:
     (:func:`~hybrid_mpc.estimate.parameters.with_parameter_states`). For a linear model this is the Kalman filter. The
     object has no state, but reuses its buffers: it is not thread-safe.
 
+    A sample of a periodic output may be wrapped: it is moved by whole periods to the one nearest to the prediction, so
+    estimates have no jumps. A measured disturbance is moved to the last one likewise. The start is as measured.
+
     A prediction is lost if it is not finite, or a standard deviation is a million times its reference: the larger of
     its first value and its step per period, and for a directly measured state the sensor's deviation (after a long time
     without measurements of an unstable model, or an absurd measurement). The next measurement then restarts the filter.
@@ -140,6 +144,11 @@ class ExtendedKalmanFilter:
         self.model, self._sizes = model, (n_x, n_h, n_d, n_y)
         self._on_u, self._on_x, self._on_y = model.disturbed
         self._noise_y = variance_y
+        self._turn_y = np.array([s.period for s in model.outputs])
+        self._turn_w = np.array([s.period for s in model.disturbances])
+        self._turns_y, self._turns_w = (
+            bool(np.isfinite(turn).any()) for turn in (self._turn_y, self._turn_w)
+        )
         self._noise = np.concatenate(
             [_variance(sigma_x, n_x, "sigma_x"), hidden, _variance(sigma_d, n_d, "sigma_d")]
         )
@@ -256,7 +265,13 @@ class ExtendedKalmanFilter:
         if w is None or not n_w:
             return last
         given = sampled(w, (n_w,), "w")
+        if self._turns_w and estimate is not None:
+            given = nearest_turn(given, last, self._turn_w)
         return np.where(np.isfinite(given), given, last)
+
+    def nearest(self, y: Array, y_hat: Array) -> Array:
+        """The sample ``(n_y,)``, periodic outputs moved by whole periods to those nearest to the predicted ones."""
+        return nearest_turn(y, y_hat, self._turn_y) if self._turns_y else y
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
@@ -310,7 +325,7 @@ class ExtendedKalmanFilter:
         if not seen.any():
             return estimate, 0.0
         y_hat, c = self._predicted(estimate, u)
-        innovation = np.where(seen, y - y_hat, np.nan)
+        innovation = np.where(seen, self.nearest(y, y_hat) - y_hat, np.nan)
         step, p, nis, size = absorbed(estimate.P, c, innovation, self._noise_y, seen)
         n_z = n_x + n_h
         x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]

@@ -264,6 +264,8 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         y = sampled(y, (self.model.n_y,), "y")
         if not np.isfinite(y).any():
             return own, 0.0
+        if self._turns_y:
+            y = self.nearest(y, self._predicted(own, u)[0])
         filtered, likelihood = super().assess(own, y, u)
         if not len(own.ys):
             return self._alone(filtered), likelihood

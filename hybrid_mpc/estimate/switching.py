@@ -188,6 +188,7 @@ class SwitchingFilter:
     ) -> tuple[SwitchingEstimate, float]:
         """Estimate after a measurement with at least one finite output, and its log-likelihood."""
         y_hat, c = self._measured(z, u, w)
+        y = self.filters[0].nearest(y, probability @ y_hat)  # one sample for all filters
         seen = np.isfinite(y)
         innovations = np.where(seen, y - y_hat, np.nan)
         step, nis, size = np.zeros(z.shape), np.zeros(len(z)), np.zeros(len(z))

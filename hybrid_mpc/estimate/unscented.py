@@ -93,7 +93,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         y_hat, of_z, of_y = self._shown(estimate, u)
         of_y, noise = of_y[:, seen], self._noise_y[seen]
         factor, _ = dpotrf(of_y.T @ of_y + np.diag(noise), 1)
-        innovation = np.where(seen, y - y_hat, np.nan)
+        innovation = np.where(seen, self.nearest(y, y_hat) - y_hat, np.nan)
         e = innovation[seen]
         gain = dpotrs(factor, of_y.T @ of_z, 1)[0].T  # K = P_zy S^-1
         rest = of_z - of_y @ gain.T

@@ -71,7 +71,10 @@ def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -
     x, u, w = (np.concatenate([getattr(t, key) for t in training]) for key in ("x", "u", "w"))
     low, high = x.min(0), x.max(0)
     angles = np.array([signal.periodic for signal in prior.states])
-    start = rng.uniform(np.where(angles, -np.pi, low), np.where(angles, np.pi, high), (RUNS, x.shape[1]))
+    turn = np.array([signal.period for signal in prior.states])
+    start = rng.uniform(
+        np.where(angles, -turn / 2, low), np.where(angles, turn / 2, high), (RUNS, x.shape[1])
+    )
     length = FOLLOWED + COUNTED
     drawn = rng.integers(len(u), size=(-(-length // HELD), RUNS))
     inputs, disturbances = (z[drawn].repeat(HELD, axis=0)[:length] for z in (u, w))
@@ -79,7 +82,7 @@ def make_prior_replay(prior: Prior, training: Sequence[Trajectory], seed: int) -
     dt = training[0].dt
     step = PriorStep(prior, dt, required_substeps(prior, dt, visited(training)))
     states = _prior_runs(step, start, (inputs, disturbances), (low - far, high + far))
-    places = _Places(angles, np.sqrt(np.mean(x**2, axis=0)).clip(1e-9))
+    places = _Places(angles, 2 * np.pi / turn, np.sqrt(np.mean(x**2, axis=0)).clip(1e-9))
     distance, _ = cKDTree(places(x)).query(places(states.reshape(-1, x.shape[1])))
     weight = 1.0 - np.exp(-((distance.reshape(states.shape[:2]) / NEAR) ** 2))
     weight *= (angles | ((states >= low) & (states <= high))).all(-1)
@@ -116,8 +119,9 @@ class _Places:
     """Maps states to scaled points for distances; an angle becomes sine and cosine."""
 
     angles: NDArray[np.bool_]
+    radians: Array
     scale: Array
 
     def __call__(self, x: Array) -> Array:
-        turns = x[:, self.angles]
+        turns = (x * self.radians)[:, self.angles]
         return np.hstack([np.sin(turns), np.cos(turns), (x / self.scale)[:, ~self.angles]])

@@ -5,7 +5,7 @@ The same code serves training (any batch) and export (one sample).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, cast
@@ -23,6 +23,7 @@ from hybrid_mpc.identify.networks import GRUNetwork, StackedGRU
 from hybrid_mpc.identify.rollout import Rollout
 from hybrid_mpc.identify.simulation import Simulation, required_substeps, stepped
 from hybrid_mpc.machine.prior import Prior
+from hybrid_mpc.machine.signals import Signal
 
 SPAN = 10
 """Periods over which the correction is averaged for its scale."""
@@ -232,6 +233,21 @@ class RecurrentStep(Step):
         """Scaled network inputs ``s``."""
         raise NotImplementedError(f"{type(self).__name__} must define features(x, u, w)")
 
+    @staticmethod
+    def _shown(signal: Signal, value: Tensor, scaled: Tensor) -> list[Tensor]:
+        """What a network sees of a signal: the scaled value, or sine and cosine of an angle."""
+        if not signal.periodic:
+            return [scaled]
+        angle = value if signal.radians == 1.0 else signal.radians * value
+        return [torch.sin(angle), torch.cos(angle)]
+
+    def _given(self, signals: Sequence[Signal], values: Tensor, scaled: Tensor) -> list[Tensor]:
+        """What a network sees of inputs or disturbances."""
+        if not any(signal.periodic for signal in signals):
+            return [scaled]
+        columns = ((s, slice(i, i + 1)) for i, s in enumerate(signals))
+        return [part for s, own in columns for part in self._shown(s, values[..., own], scaled[..., own])]
+
     def integrate(
         self, x: Tensor, u: Tensor, w: Tensor, correction: Tensor, p: Tensor | None = None
     ) -> Tensor:
@@ -369,14 +385,11 @@ class HybridStep(RecurrentStep):
         """Scaled network inputs ``s = [x, u, w, prior's rates]``; a periodic angle is replaced by its sin and cos."""
         parts, scaled = [], (x - self.scale_centre_x) / self.scale_x
         for i, signal in enumerate(self.prior.states):
-            if signal.periodic:
-                component = x[..., i : i + 1]
-                parts += [torch.sin(component), torch.cos(component)]
-            else:
-                parts.append(scaled[..., i : i + 1])
-        parts.append((u - self.scale_centre_u) / self.scale_u)
+            own = slice(i, i + 1)
+            parts += self._shown(signal, x[..., own], scaled[..., own])
+        parts += self._given(self.prior.inputs, u, (u - self.scale_centre_u) / self.scale_u)
         if self.prior.disturbances:
-            parts.append((w - self.scale_centre_w) / self.scale_w)
+            parts += self._given(self.prior.disturbances, w, (w - self.scale_centre_w) / self.scale_w)
         if self.use_prior:
             parts.append(self.prior_rates(x, u, w)[..., self.corrected] / self.scale_rate)
             if self.trained is not None:  # each network has its own features
@@ -426,10 +439,14 @@ class HybridStep(RecurrentStep):
         scale, centre = (
             {k: ca.DM(getattr(self, f"scale_{a}{k}").numpy()) for k in "xuw"} for a in ("", "centre_")
         )
-        parts, scaled = [], (x - centre["x"]) / scale["x"]
-        for i, signal in enumerate(prior.states):
-            parts += [ca.sin(x[i]), ca.cos(x[i])] if signal.periodic else [scaled[i]]
-        parts += [(u - centre["u"]) / scale["u"], (w - centre["w"]) / scale["w"]]
+        parts = []
+        for key, values, signals in (
+            ("x", x, prior.states), ("u", u, prior.inputs), ("w", w, prior.disturbances)
+        ):  # fmt: skip
+            scaled = (values - centre[key]) / scale[key]
+            for i, signal in enumerate(signals):
+                angle = signal.radians * values[i]
+                parts += [ca.sin(angle), ca.cos(angle)] if signal.periodic else [scaled[i]]
         if self.use_prior:
             parts.append(xdot(x, u, w, shifted)[list(prior.corrected)] / ca.DM(self.scale_rate.numpy()))
         own = ca.DM.ones(sizes["x"]) if self.use_prior else ca.DM(self.own_rows.numpy())
@@ -459,9 +476,9 @@ class HybridStep(RecurrentStep):
 
 def n_features(prior: Prior, use_prior: bool) -> int:
     """Number of features of a :class:`HybridStep`'s network."""
-    angles = sum(signal.periodic for signal in prior.states)
-    signals = len(prior.states) + angles + len(prior.inputs) + len(prior.disturbances)
-    return signals + (len(prior.corrected) if use_prior else 0)
+    signals = (*prior.states, *prior.inputs, *prior.disturbances)
+    angles = sum(signal.periodic for signal in signals)
+    return len(signals) + angles + (len(prior.corrected) if use_prior else 0)
 
 
 def rms(values: Tensor) -> tuple[float, ...]:

@@ -28,6 +28,7 @@ from hybrid_mpc.identify.sound import shooting
 from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.identify.windows import OutputWindows
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
+from hybrid_mpc.machine.units import turn_in
 
 Array = NDArray[np.float64]
 LARGEST = 1e7
@@ -81,8 +82,6 @@ STEPS = 3
 """Pairs of Gauss-Newton steps of a trial fit, which only estimates the size of an error."""
 MOST = 3
 """Maximum number of equal explanations that are reported."""
-ANGLES: Mapping[str, float] = {"rad": 0.5 * math.pi, "deg": 90.0}
-"""A quarter of a turn in the units of angles."""
 
 
 VAGUE = ("its sign seems wrong, and its size too", "a factor or a unit seems to be wrong")
@@ -769,8 +768,8 @@ def _signals(
             name = f"{kind} {signal.label}"
             if key == "y" and signal.lower < 0.0 < signal.upper:  # for an input, the factor covers this case
                 changes.append((name, "it seems to be counted the other way", _changed(key, j, j, -1.0)))
-            for turns in (2.0, 1.0, -1.0) if signal.unit in ANGLES and key == "y" else ():
-                off = turns * ANGLES[signal.unit]
+            turn = turn_in(signal.unit) if key == "y" else None
+            for off in () if turn is None else (turn / 2, turn / 4, -turn / 4):
                 why = f"{off:+.4g} {signal.unit} seems to be missing: the angle is counted from another zero"
                 changes.append((name, why, _changed(key, j, j, 1.0, off)))
             changes += [

@@ -159,9 +159,12 @@ class _Library:
             weight(f"F_{k}", size, p, words="dry friction along the way")
             for k, size, p in zip((1, 2), sizes, per, strict=True)
         ]
-        yield _one(
-            laws.coulomb_by_position(own, *names, turning=turning, centre=0.0 if turning else centre, **at)
-        )
+        if turning or not self.prior.states[q].periodic:  # the term's sine is that of radians
+            yield _one(
+                laws.coulomb_by_position(
+                    own, *names, turning=turning, centre=0.0 if turning else centre, **at
+                )
+            )
         yield _one(laws.offset(own, weight("F_0", 1.0, words="offset"), place=place))
         if not self.mechanical:
             return

@@ -32,6 +32,7 @@ from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
 from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held, n_tracked, with_unknown
+from hybrid_mpc.machine.signals import nearest_turn as moved_by_turns
 from hybrid_mpc.model.limits import check_function, check_part, floats, sampled, whole
 from hybrid_mpc.model.model import HybridModel
 
@@ -129,6 +130,9 @@ class Loop:
         reference: ``t (n,) [s] -> (n, n_x)``, or ``(n, n_y)`` if the problem weights outputs, previewed over the
             horizon if the problem does so, with ``n_p`` more columns if the economic stage cost has parameters; or a
             set-point ``(n_x,)`` or ``(n_y,)``. Default: the operating point.
+        nearest_turn: True: references of periodic signals are moved by whole periods, the present one to the nearest of
+            the estimate, each later one to the nearest of the one before; a set-point is then reached the short way.
+            Default: False; references count turns.
         weight: Factors on ``q``, ``t (n,) -> (n, n_x)``. Default: 1.
         guard: Reaction to alarms of the monitor, which it needs. Default: none.
         w: Forecast of the measured disturbances, ``t (n,) [s] -> (n, n_measured)``, for a problem that previews them.
@@ -168,6 +172,7 @@ class Loop:
         monitor: Monitor | None = None,
         reference: Preview | ArrayLike | None = None,
         weight: Preview | None = None,
+        nearest_turn: bool = False,
         guard: Guard | None = None,
         w: Preview | None = None,
         end: float = math.inf,
@@ -197,6 +202,11 @@ class Loop:
         self._tracked = n_tracked(estimator)
         self._forecast = Forecast(w, self.ocp, self.n_measured, self.model.dt, self._tracked)
         self._truth, self._now = sees_truth(estimator), now
+        followed = self.model.outputs if self.ocp.n_y else self.model.states
+        self._turn_y = np.array([s.period for s in self.model.outputs])
+        self._turns = bool(np.isfinite(self._turn_y).any())
+        turn = np.array([s.period if nearest_turn else math.inf for s in followed])
+        self._turn_ref = turn if np.isfinite(turn).any() else None
         self._state: LoopState | None = None
         self._decide_late: Callable[[], tuple[Decision, GuardState]] | None = None
         self._ahead: _Ahead | None = None
@@ -234,6 +244,7 @@ class Loop:
         estimate = self._estimator.start(
             self._choose_measurement(sample, truth), 0.0, **self._select_measured(measured)
         )
+        x_ref = self._near(x_ref, estimate, self.model.u0)
         until = None if applied is None else sampled(applied, (self.ocp.n_u,), "applied")
         ahead = self._predict_disturbances(0, measured, estimate)
         first = self._safe.initial(estimate, until, x_ref, factors, ahead)
@@ -287,6 +298,9 @@ class Loop:
             estimate = self._estimator.start(seen, k * self.model.dt, **also)
         else:
             estimate = self._estimator.update(state.estimate, seen, previous.u, **also)
+        x_ref = self._near(x_ref, estimate, previous.u)
+        if self._turns:
+            sample = moved_by_turns(sample, self._outputs(estimate, previous.u), self._turn_y)
         self._state = replace(state, k=k, y=sample, estimate=estimate, inputs=inputs, finished=False)
         self.spent = {**dict.fromkeys(TIMED, 0.0), "estimate": self._now() - begin}
         return self._decide(previous, x_ref, factors, in_time, measured)
@@ -512,6 +526,25 @@ class Loop:
                     "reference: no rows; give a set-point, or a row for each period ahead [HM-LOOP-024]"
                 )
         return x_ref, factors
+
+    def _outputs(self, estimate: Estimate, u: Array) -> Array:
+        """Outputs ``(n_y,)`` of an estimate under the input ``u``."""
+        m, (on_u, _, on_y) = self.model, self.model.disturbed
+        y = m.output(estimate.x, u + on_u @ estimate.d, estimate.w if m.n_w else m.w, m.p).full().ravel()
+        return np.asarray(y + on_y @ estimate.d)
+
+    def _near(self, x_ref: Array, estimate: Estimate, u: Array) -> Array:
+        """The reference with periodic signals moved by whole periods, if the loop has ``nearest_turn``."""
+        if self._turn_ref is None:
+            return x_ref
+        now, n = self._outputs(estimate, u) if self.ocp.n_y else estimate.x, self._turn_ref.size
+        rows = np.vstack([now, x_ref[:, :n]])
+        # nearest to the row before: turns of all steps until then
+        with np.errstate(invalid="ignore"):
+            turns = np.nan_to_num(np.rint(np.diff(rows, axis=0) / self._turn_ref))
+        turns = np.cumsum(turns, axis=0)
+        moved = np.where(turns != 0, rows[1:] - turns * np.where(turns != 0, self._turn_ref, 0.0), rows[1:])
+        return np.hstack([moved, x_ref[:, n:]])
 
     def _take_preparation(self, previous: Decision, weight: Array | None) -> Any:
         """The preparation of :meth:`finish`, if it belongs to this solve."""

@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybrid_mpc.machine.units import turn_in
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Bound, Line, Name, Number, Unit
 
@@ -20,15 +24,16 @@ class Signal:
         lower: Smallest plausible value [unit]; smaller data are refused, smaller speeds differentiated from data raise
             a warning. Default: no bound.
         upper: Largest plausible value [unit], likewise. Default: no bound.
-        periodic: True for an angle that may turn by full turns: networks see its sine and cosine, and wrapped
-            recordings are unwrapped.
+        periodic: True for an angle that may turn by full turns, in a unit of angles (``rad``, ``deg``, ``rev``, ...):
+            networks see its sine and cosine, wrapped recordings are unwrapped, and observers move a sample by whole
+            turns to their prediction.
         saturation: Smallest and largest value [unit] that the sensor can show, ``(-inf, upper)`` or ``(lower, inf)`` if
             it has one end. A sample at or beyond an end is censored: it only bounds the true value from one side.
             Default: the sensor shows every value.
 
     Raises:
-        InputError: With all problems: a field of a wrong kind, an empty range, an empty sensor range, or a sensor range
-            of a periodic signal.
+        InputError: With all problems: a field of a wrong kind, an empty range, an empty sensor range, a sensor range
+            of a periodic signal, or a periodic signal whose unit is not one of an angle.
 
     Example:
         >>> Signal("phi", "rad").label
@@ -60,12 +65,53 @@ class Signal:
             "a periodic signal cannot have a saturation, since its sensor restarts at a full turn. Leave one of them "
             "out. [HM-MACHINE-021]",
         )  # fmt: skip
+        own.need(
+            "unit periodic", lambda: not self.periodic or turn_in(self.unit) is not None,
+            f"periodic=True needs a unit of angles, which gives the period (rad, deg, rev, turn), got {self.unit}. "
+            "Give the unit, or leave periodic out. [HM-MACHINE-047]",
+        )  # fmt: skip
         own.refuse()
+
+    @property
+    def period(self) -> float:
+        """A full turn of a periodic signal [unit]; infinite if the signal is not periodic.
+
+        Example:
+            >>> Signal("psi", "deg", periodic=True).period, Signal("psi", "deg").period
+            (360.0, inf)
+        """
+        turn = turn_in(self.unit) if self.periodic else None
+        return math.inf if turn is None else turn
+
+    @property
+    def radians(self) -> float:
+        """Factor from a periodic signal's unit to radians, exactly 1 for ``rad``; 0 if the signal is not periodic."""
+        return 2.0 * math.pi / self.period
 
     @property
     def label(self) -> str:
         """Name with unit, as plots and tables print it."""
         return f"{self.name} [{self.unit}]"
+
+
+def nearest_turn(values: ArrayLike, to: ArrayLike, period: ArrayLike) -> NDArray[np.float64]:
+    """Values moved by whole periods to those nearest to other values; not finite ones stay, as with infinite periods.
+
+    A value at most half a period away stays as it is.
+
+    Args:
+        values: Values ``(..., n)``.
+        to: The other values, likewise.
+        period: Period of each ``(n,)``, in the unit of its values (:attr:`Signal.period`).
+
+    Example:
+        >>> nearest_turn([1.0, 5.0], [359.0, 359.0], [360.0, math.inf]).tolist()
+        [361.0, 5.0]
+    """
+    moved, near, whole = (np.asarray(v, dtype=np.float64) for v in (values, to, period))
+    with np.errstate(over="ignore", invalid="ignore"):
+        turns = np.rint((moved - near) / whole)
+        return np.where(np.isfinite(turns) & (turns != 0.0), moved - turns * whole, moved)
 
 
 @dataclass(frozen=True)

@@ -160,6 +160,18 @@ def conversion(one: str, other: str) -> Conversion | str:
     return Conversion(size)
 
 
+def turn_in(unit: str) -> float | None:
+    """A full turn in a unit of angles; None for every other unit.
+
+    Example:
+        >>> turn_in("rad") == 2 * math.pi, turn_in("deg"), turn_in("rev"), turn_in("m"), turn_in("-")
+        (True, 360.0, 1.0, None, None)
+    """
+    found = conversion("rev", unit)
+    angle = isinstance(found, Conversion) and any(word in _TURNING for word in _words(unit))
+    return found.factor if isinstance(found, Conversion) and angle else None
+
+
 def plain(unit: str) -> str:
     """A unit in one spelling.
 

@@ -149,7 +149,7 @@ def coverage(
         look = {"color": colour(piece.role), "label": name_of(piece.role)}
         width = 2.4 if piece.role == "train" else 1.0
         for (q, v), ax in zip(pairs, panels, strict=False):
-            position = _wrap(x[:, q]) if states[q].periodic else x[:, q]
+            position = _wrap(x[:, q], states[q].period / 2) if states[q].periodic else x[:, q]
             ax.plot(position, x[:, v], linewidth=width, **look)
         for values, ax in zip(() if pairs else x.T, panels, strict=False):
             ax.plot(piece.t, values, linewidth=1.2, **look)
@@ -165,10 +165,10 @@ def coverage(
     return figure
 
 
-def _wrap(angle: Array) -> Array:
-    """Wrap an angle to [-pi, pi); NaN where it jumps from one side to the other, so no line joins the two."""
-    within = (angle + np.pi) % (2.0 * np.pi) - np.pi
-    jumps = np.abs(np.diff(within, append=within[-1:])) > np.pi
+def _wrap(angle: Array, half: float) -> Array:
+    """Wrap an angle to half a turn around zero; NaN where it jumps to the other side, so no line joins the two."""
+    within = (angle + half) % (2.0 * half) - half
+    jumps = np.abs(np.diff(within, append=within[-1:])) > half
     return np.where(jumps, np.nan, within)
 
 

@@ -276,15 +276,18 @@ typedef struct {
 #if HMPC_MODES > 0
   hmpc_filter filter[HMPC_MODES], predicted[HMPC_MODES], mixed;
   hmpc_real probability[HMPC_MODES];
+#if HMPC_TURNS
+  hmpc_real y[HMPC_NY]; /* the last sample, its periodic outputs moved by whole periods to the estimate */
+#endif
   hmpc_real transition[HMPC_NE][HMPC_LE], product[HMPC_NE][HMPC_LE], stage[HMPC_NZ][HMPC_LJ];
 #endif
 } hmpc_state;
 
 #if HMPC_MODES > 0
 /* hmpc_start: first estimate, first plan (slower than a step), first input. hmpc_step: estimate and decision of one
-   period. y: outputs; a non-finite value is a missing sample. w: measured disturbances, HMPC_MEASURED; NULL or not
-   finite: the last values. applied: input that acted until now; NULL: the operating point's input, in hmpc_step the
-   last decision. */
+   period. y: outputs; a non-finite value is a missing sample; periodic ones may be wrapped. w: measured disturbances,
+   HMPC_MEASURED; NULL or not finite: the last values. applied: input that acted until now; NULL: the operating point's
+   input, in hmpc_step the last decision. */
 void hmpc_start(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
 void hmpc_step(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_real *applied, const hmpc_goal *goal);
 /* Runs the monitor, determines the guard's next mode, and prepares the part of the next step that needs no sample.

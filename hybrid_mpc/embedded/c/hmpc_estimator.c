@@ -18,14 +18,29 @@ enum {
   START_SWEEPS = 30    /* of Jacobi rotations */
 };
 
-static void known_w(hmpc_state *s, const real *w) {
+#if HMPC_TURNS
+/* A value moved by whole periods to the one nearest to another; with an infinite period it stays. */
+static real nearest_turn(real value, real to, real period) {
+  const real turns = HMPC_LIBM(rint)((value - to) / period);
+  return hmpc_finite(turns) && hmpc_abs(turns) > R(0.0) ? value - turns * period : value;
+}
+#endif
+
+static void known_w(hmpc_state *s, const real *w, int first) {
 #if HMPC_NW > 0
   for (int i = 0; i < HMPC_MEASURED && w; ++i)
-    if (hmpc_finite(w[i])) s->w[i] = w[i];
+    if (hmpc_finite(w[i])) {
+#if HMPC_TURNS
+      s->w[i] = first ? w[i] : nearest_turn(w[i], s->w[i], w_period[i]);
+#else
+      s->w[i] = w[i];
+#endif
+    }
 #else
   (void)s;
   (void)w;
 #endif
+  (void)first;
 }
 
 static int any_finite(const real *y) {
@@ -227,8 +242,11 @@ static void start_at(const hmpc_state *s, const real *y, int mode, real *z) {
 /* Estimate at rest: the state closest to the operating point with these outputs. */
 void hmpc_estimate_start(hmpc_state *s, const real *y, const real *w) {
   real z[HMPC_LE];
-  known_w(s, w);
+  known_w(s, w, 1);
   for (int i = HMPC_MEASURED; i < HMPC_NW; ++i) s->w[i] = w_rest[i]; /* the fitted values, theta = 0 */
+#if HMPC_TURNS
+  memcpy(s->y, y, sizeof s->y);
+#endif
   for (int m = 0; m < HMPC_MODES; ++m) {
     hmpc_filter *const f = &s->filter[m];
     if (m < HMPC_START_MODES) start_at(s, y, m, z); /* the other modes start equally */
@@ -349,7 +367,10 @@ void hmpc_estimate_update(hmpc_state *s, const real *y, const real *u_prev, cons
     }
   }
   memcpy(s->filter, s->predicted, sizeof s->filter);
-  known_w(s, w);
+  known_w(s, w, 0);
+#if HMPC_TURNS
+  memcpy(s->y, y, sizeof s->y);
+#endif
   if (!any_finite(y)) {
     memcpy(s->probability, after, sizeof after);
     together(s, after);
@@ -361,6 +382,17 @@ void hmpc_estimate_update(hmpc_state *s, const real *y, const real *u_prev, cons
     hmpc_estimate_start(s, y, (const real *)0);
     return;
   }
+#if HMPC_TURNS
+  /* one sample for all filters: periodic outputs nearest to the mean prediction */
+  real mean[HMPC_NY] = {R(0.0)};
+  for (int j = 0; j < HMPC_MODES; ++j) {
+    real y_hat[HMPC_NY], slope[HMPC_NY][HMPC_NE];
+    measured(s->filter[j].z, u_prev, s->w, y_hat, slope);
+    hmpc_add(mean, after[j], y_hat, HMPC_NY);
+  }
+  for (int i = 0; i < HMPC_NY; ++i) s->y[i] = nearest_turn(y[i], mean[i], y_period[i]);
+  y = s->y;
+#endif
   real largest = -R(INFINITY);
   for (int j = 0; j < HMPC_MODES; ++j) {
     correct(s, &s->filter[j], y, u_prev, j);

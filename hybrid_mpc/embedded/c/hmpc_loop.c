@@ -145,6 +145,9 @@ static void watched(hmpc_state *s) {
 
 static void sampled(hmpc_state *s, const real *y, const real *held) {
 #if HMPC_MONITOR
+#if HMPC_TURNS
+  y = s->y;
+#endif
   memcpy(s->sample, y, sizeof s->sample);
   memcpy(s->acted, held, sizeof s->acted);
   s->watched = 0;
