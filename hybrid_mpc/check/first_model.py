@@ -23,6 +23,8 @@ MATTERS = 0.1
 """Least share of an output's variance that its lag explains, for its time constant to matter."""
 STRIDES = (1, 4, 16)
 """Distances [samples] of the predictions from which a growth rate is estimated."""
+FINEST = (1, 2, 4)
+"""Factors on these distances, tried in turn."""
 SHOWN = 10.0
 """Least length of a recording over a time constant that it identifies: any input explains a few slow motions."""
 FAR = 5.0
@@ -258,30 +260,38 @@ def growth_of(runs: Sequence[Runs], dt: float) -> float:
     """Rate [1/s] at which the machine diverges from its steady state by itself; zero if the data do not show it.
 
     From the largest pole of predictions over several strides, for all recordings and for either half of them, if these
-    agree. Feedback biases one-step predictions only little.
+    agree. Feedback biases one-step predictions little, unless noise exceeds the motion of a sample: then strides of
+    twice or four times the length may agree.
     """
-    found = []
-    for stride in STRIDES:
-        parts = _middles(runs, stride)
-        halves = [
-            [Runs(*(a[: len(a) // 2] for a in run)) for run in parts],
-            [Runs(*(a[len(a) // 2 :] for a in run)) for run in parts],
-        ]
-        for part in (parts, *halves):
-            fitted = _predictor(part)
-            if fitted is None:
-                return 0.0
-            n = runs[0].y.shape[1]
-            matrix = np.eye(LAGS * n, k=-n)
-            matrix[:n] = fitted[: LAGS * n].T
-            # companion matrix of the predictor: its largest eigenvalue z gives the rate ln|z| / (stride dt)
-            largest = float(np.abs(np.linalg.eigvals(matrix)).max())
-            found.append(math.log(largest) / (stride * dt) if largest > 0 else -math.inf)
     length = dt * max(len(run.y) for run in runs)
     pace = 1 / max(1e-300, *(pace_of(runs, i, dt) for i in range(runs[0].y.shape[1])))
-    return (
-        float(np.median(found)) if min(found) > max(AGREE * max(found), GROWS / length, PACE * pace) else 0.0
-    )
+    for finest in FINEST:
+        found = [rate for stride in STRIDES for rate in _growths(runs, finest * stride, dt)]
+        if found and min(found) > max(AGREE * max(found), GROWS / length, PACE * pace):
+            return float(np.median(found))
+    return 0.0
+
+
+def _growths(runs: Sequence[Runs], stride: int, dt: float) -> list[float]:
+    """Growth rates [1/s] of predictions over a stride, from all of the recordings and from either half of them;
+    minus infinity for too few rows.
+    """
+    parts, found = _middles(runs, stride), []
+    halves = [
+        [Runs(*(a[: len(a) // 2] for a in run)) for run in parts],
+        [Runs(*(a[len(a) // 2 :] for a in run)) for run in parts],
+    ]
+    for part in (parts, *halves):
+        fitted = _predictor(part)
+        if fitted is None:
+            return [-math.inf]
+        n = runs[0].y.shape[1]
+        matrix = np.eye(LAGS * n, k=-n)
+        matrix[:n] = fitted[: LAGS * n].T
+        # companion matrix of the predictor: its largest eigenvalue z gives the rate ln|z| / (stride dt)
+        largest = float(np.abs(np.linalg.eigvals(matrix)).max())
+        found.append(math.log(largest) / (stride * dt) if largest > 0 else -math.inf)
+    return found
 
 
 def _middles(runs: Sequence[Runs], stride: int) -> list[Runs]:

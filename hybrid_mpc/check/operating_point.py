@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.check.prior import DRIFT
 from hybrid_mpc.identify.simulation import rest_of
+from hybrid_mpc.identify.smooth import output_slope
 from hybrid_mpc.machine.prior import OperatingPoint, Prior
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.model.equilibrium import RateEquations, rate_search
+from hybrid_mpc.model.equilibrium import Descent, RateEquations, rate_search
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -45,8 +46,13 @@ def holding_input(prior: Prior) -> OperatingPoint | None:
 
     States that belong to terms, such as that of a lag, follow the input.
     """
-    n_x, own = len(prior.states), len(getattr(type(prior), "base", type(prior)).states)
-    return _search(prior, np.arange(own, n_x + len(prior.inputs)))
+    return _search(prior, _places_of_inputs(prior))
+
+
+def _places_of_inputs(prior: Prior) -> Places:
+    """Places of the inputs, and of the states of terms, in ``(x, u)``."""
+    own = len(getattr(type(prior), "base", type(prior)).states)
+    return np.arange(own, len(prior.states) + len(prior.inputs))
 
 
 def steady_point(prior: Prior) -> OperatingPoint | None:
@@ -71,12 +77,28 @@ def both_ways(prior: Prior) -> str:
     """The two equilibria beside an operating point that is none, as text to copy."""
     held, holding = held_states(prior), holding_input(prior)
     states = "no states within their ranges" if held is None else f"x = {_numbers(held.x)}"
-    inputs = "no input within its range" if holding is None else f"u = {_numbers(holding.u)}"
+    inputs = _why_not_held(prior) if holding is None else f"u = {_numbers(holding.u)}"
     if holding is not None and any(
         abs(a - b) > 1e-9 * max(1.0, abs(b)) for a, b in zip(holding.x, rest_of(prior)[0], strict=True)
     ):
         inputs += f" with x = {_numbers(holding.x)}"
     return f"States that your input holds: {states}. Input that holds your states: {inputs}"
+
+
+def _why_not_held(prior: Prior) -> str:
+    """Why no input holds the operating point's states, and an equilibrium with one of its outputs, if there is one."""
+    text = "no input within its range" if _found(prior, _places_of_inputs(prior)).steady else (
+        "none, not even beyond its range, because an equation of your states has no input"
+    )  # fmt: skip
+    x, u, w = rest_of(prior)
+    by_x = output_slope(prior.equations)(x, u, w, prior.p)[1].full()
+    for signal, row in zip(prior.outputs, by_x, strict=True):
+        # an output that shows one state keeps its value if this state is held
+        if np.flatnonzero(row).size == 1:
+            free = np.delete(np.arange(len(x) + len(u)), np.flatnonzero(row))
+            if (point := _search(prior, free)) is not None:
+                return f"{text}. With your {signal.name}: x = {_numbers(point.x)}, u = {_numbers(point.u)}"
+    return text
 
 
 def sizes_of(signals: tuple[Signal, ...], at: Array) -> Array:
@@ -86,19 +108,25 @@ def sizes_of(signals: tuple[Signal, ...], at: Array) -> Array:
 
 
 def _search(prior: Prior, free: Places) -> OperatingPoint | None:
-    """The equilibrium that a search over the free ones of ``(x, u)`` finds from the operating point."""
+    """The equilibrium within the ranges that a search over the free ones of ``(x, u)`` finds."""
     (x, u, w), n_x = rest_of(prior), len(prior.states)
-    ranges = np.array([s.upper - s.lower for s in prior.inputs], dtype=np.float64)
-    sizes = np.where(np.isfinite(ranges), ranges, np.where(u != 0, np.abs(u), 1.0))
-    near, scale = np.concatenate([x, u]), np.concatenate([sizes_of(prior.states, x), sizes])
-    equations = RateEquations(prior.equations.xdot, w, prior.p)
-    found = rate_search(equations, scale, near, np.zeros(n_x), free=free).descend(near, x)
+    found, near = _found(prior, free), np.concatenate([x, u])
     signals = (*prior.states, *prior.inputs)
     if not found.steady or not all(s.lower <= v <= s.upper for s, v in zip(signals, found.v, strict=True)):
         return None
     # what the search left alone keeps its exact value
     values = [float(f"{v:.{WRITTEN}g}") + 0.0 if k in free else float(near[k]) for k, v in enumerate(found.v)]
     return OperatingPoint(tuple(values[:n_x]), tuple(values[n_x:]), tuple(w.tolist()))
+
+
+def _found(prior: Prior, free: Places) -> Descent:
+    """End of the search over the free ones of ``(x, u)`` from the operating point, without ranges."""
+    x, u, w = rest_of(prior)
+    ranges = np.array([s.upper - s.lower for s in prior.inputs], dtype=np.float64)
+    sizes = np.where(np.isfinite(ranges), ranges, np.where(u != 0, np.abs(u), 1.0))
+    near, scale = np.concatenate([x, u]), np.concatenate([sizes_of(prior.states, x), sizes])
+    equations = RateEquations(prior.equations.xdot, w, prior.p)
+    return rate_search(equations, scale, near, np.zeros(len(x)), free=free).descend(near, x)
 
 
 def _numbers(values: tuple[float, ...]) -> str:

@@ -91,7 +91,7 @@ def check(
     if in_doubt:
         console.print("\nCorrect the prior before a run; docs/prior-wrong.md explains each doubt.")
         if lacking:
-            words = ["hybrid-mpc", "explain", *scenario, *settings.options(str)]
+            words = ["hybrid-mpc", "explain", scenario, *settings.options(str)]
             console.print(
                 f"A physical term may be missing: '{shlex.join(words)}' searches for it (docs/explain.md).",
                 markup=False, soft_wrap=True,

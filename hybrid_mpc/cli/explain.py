@@ -107,9 +107,7 @@ def _tests(found: ExplainResult) -> Table:
     from hybrid_mpc.workflow.explain_page import MODELS
 
     labels = list(next(iter(found.tests.values())).rmse)
-    table = _table(
-        "free runs over the test recordings", "model", "error [-]", *(f"RMSE {one}" for one in labels)
-    )
+    table = _table(found.tests_title, "model", "error [-]", *(f"RMSE {one}" for one in labels))
     for name, one in found.tests.items():
         table.add_row(MODELS[name], f"{one.error:.3g}", *(f"{one.rmse[label]:.4g}" for label in labels))
     return table

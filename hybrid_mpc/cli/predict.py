@@ -48,14 +48,14 @@ def predict(
 
 def summary(found: Sequence[Prediction]) -> list[str]:
     """One line per recording, kind of prediction and output."""
-    lines = [f"{'recording':16} {'':14} {'output':20} {'RMSE':>10} {'FIT [%]':>8} {'in band':>8} {'of':>5}"]
+    lines = [f"{'recording':16} {'':22} {'output':20} {'RMSE':>10} {'FIT [%]':>8} {'in band':>8} {'of':>5}"]
     for one in found:
-        for kind, run in (("free run", one.free_run), ("one step", one.one_step)):
+        for kind, run in ((one.title, one.free_run), ("one step", one.one_step)):
             if run is None:
                 lines.append(f"{one.name:16} one step: {one.reason}")
                 continue
             lines += [
-                f"{one.name:16} {kind:14} {label:20} {_number(error):>10} {_number(run.fit_percent[label], 3):>8} "
+                f"{one.name:16} {kind:22} {label:20} {_number(error):>10} {_number(run.fit_percent[label], 3):>8} "
                 f"{_share(run.inside[label]):>8} {100 * run.share:>3.0f} %"
                 for label, error in run.rmse.items()
             ]

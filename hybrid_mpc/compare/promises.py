@@ -65,6 +65,13 @@ CONSTANTS = 3
 """Time constants of the observer after which a load counts as estimated: exp(-3) = 5 % is left."""
 AT_LIMIT = 1e-3
 """Distance from a limit, over the input's range, that counts as at the limit."""
+LEAVES = 2.0
+"""Distance of a state from its set-point, in its range, from which on the loop fails."""
+BEFORE = 5
+"""Periods before the first failed solve that tell whether an input was at its limit."""
+GROWTHS = 3.0
+"""Horizon of an unstable machine, in times in which small errors grow tenfold: over longer horizons the linearized plan
+amplifies rounding and model errors more than a thousandfold."""
 TAIL = (0.05, 0.01)
 """Remaining shares of the cost between which the time constant of its slowest mode is measured."""
 LOOKED, LEAST = 20, 2000
@@ -230,12 +237,19 @@ class Trial:
         settled_s: Time after which all stay within the noise [s]; None if they do not.
         why: Why they do not settle; empty if they do.
         result: The loop's record.
+        fails: Which state leaves its range by far, and when, with the first failed solve. Default: none does.
     """
 
     deviations: tuple[Deviation, ...]
     settled_s: float | None
     why: str
     result: ClosedLoopResult = field(repr=False)
+    fails: str = ""
+
+    @property
+    def solved(self) -> NDArray[np.bool_]:
+        """Mask of the periods whose solve succeeded ``(n,)``."""
+        return np.array([source == Source.MPC.name for source in self.result.source])
 
     @property
     def worst(self) -> Deviation:
@@ -435,7 +449,9 @@ def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int
     settled = _find_settled(errors[:, point.held], point.sigma[point.held], point.problem.horizon)
     kept = all(one.kept for one in found)
     settled_s = None if settled is None or not kept else settled * model.dt
-    return Trial(found, settled_s, "" if kept else _explain_offset(point, result, errors), result)
+    fails = _explain_failure(point, result)
+    why = "" if kept else fails or _explain_offset(point, result, errors)
+    return Trial(found, settled_s, why, result, fails)
 
 
 def deviations(
@@ -466,15 +482,82 @@ def _find_settled(errors: Array, sigma: Array, horizon: int) -> int | None:
     return last if last < len(means) else None
 
 
+def _explain_failure(point: SetPoint, result: ClosedLoopResult) -> str:
+    """Which state leaves its declared range by far, and when, with the first failed solve; empty if none does."""
+    model = point.model
+    with np.errstate(invalid="ignore", over="ignore"):
+        within = np.abs(result.x - point.rest[0]) <= LEAVES * _compute_ranges(model)
+    if within.all():
+        return ""
+    k, i = (int(own[0]) for own in np.nonzero(~within))
+    signal = model.states[i]
+    text = (
+        f"{signal.name} is far beyond its range of {signal.lower:g} to {signal.upper:g} {signal.unit} after "
+        f"{k * model.dt:.3g} s"
+    )
+    failed = np.flatnonzero([source != Source.MPC.name for source in result.source])
+    if not failed.size:
+        return f"{text}; no solve failed"
+    share = f"{failed.size} of {len(result.source)} failed"
+    return f"{text}; first failed solve after {failed[0] * model.dt:.3g} s ({share})"
+
+
+def failing_loop(points: Sequence[SetPoint], every: Sequence[Sequence[Trial]]) -> Promise | None:
+    """Row "closed loop": a loop whose machine leaves its declared ranges by far; None if all stay near them.
+
+    Args:
+        points: The set-points.
+        every: The trials of each.
+    """
+    failing = [
+        (point, one) for point, trials in zip(points, every, strict=True) for one in trials if one.fails
+    ]
+    if not failing:
+        return None
+    (point, worst), total = failing[0], sum(len(trials) for trials in every)
+    evidence = (
+        f"the loop fails in {len(failing)} of {counted(total, 'trial')} with constant loads and parameters up to "
+        f"{100 * OFF:.0f} % off: in {point.title} {worst.fails}"
+    )
+    return Promise("closed loop", "not promised", evidence, _choose_failure_remedy(point, worst))
+
+
+def _choose_failure_remedy(point: SetPoint, failing: Trial) -> str:
+    """Remedy for a loop that fails, by its solves and the growth of small errors at the set-point."""
+    solved, problem = failing.solved, point.problem
+    first = len(solved) if solved.all() else int(np.argmin(solved))
+    before, edge = failing.result.u[max(0, first - BEFORE) : first], AT_LIMIT * problem.input_range
+    at = (before >= problem.u_max - edge) | (before <= problem.u_min + edge)
+    if solved.all() or (at.size and at.mean(axis=0).max() > 0.5):
+        return (
+            "The controller's input does not hold the machine against these loads: choose set-points farther from the "
+            "limits of the inputs, a stronger actuator, or a better prior."
+        )
+    finite = "write a prior that is finite beyond the ranges of its states (docs/unstable.md)"
+    tenfold = _compute_growth(point)
+    periods = math.ceil(GROWTHS * tenfold / point.model.dt) if math.isfinite(tenfold) else 0
+    if 0 < periods < point.problem.horizon:
+        return (
+            f"Use a shorter horizon: small errors grow tenfold in {tenfold:.2g} s, and {periods} periods are "
+            f"{GROWTHS:g} times that time. Or {finite}."
+        )
+    return f"{finite[0].upper()}{finite[1:]}."
+
+
+def _compute_growth(point: SetPoint) -> float:
+    """Time [s] in which small errors grow tenfold at the set-point, without control; infinite if they do not."""
+    model, (x, u) = point.model, point.rest
+    h = hidden_fixed_point(model, x, u, w=point.w)
+    assert model.with_jacobian is not None  # every model has it once it is made
+    a = model.with_jacobian(x, h, u, point.w, model.p)[2].full()
+    largest = float(np.abs(np.linalg.eigvals(a)).max(initial=0.0)) if np.isfinite(a).all() else 0.0
+    return model.dt * math.log(10.0) / math.log(largest) if largest > 1.0 + 1e-6 else math.inf
+
+
 def _explain_offset(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
     """Why a loop does not settle within the noise."""
     problem, model = point.problem, point.model
     late = slice(int((1.0 - END) * len(errors)), None)
-    if not np.all(np.isfinite(result.x)):
-        return "the loop diverges"
-    away = np.abs(result.x[late] - point.rest[0]).max(axis=0) > 2.0 * np.abs(_compute_ranges(model))
-    if away.any():
-        return f"the loop does not keep {model.states[int(np.flatnonzero(away)[0])].name} within its range"
     edge = AT_LIMIT * problem.input_range
     at = np.mean((result.u[late] >= problem.u_max - edge) | (result.u[late] <= problem.u_min + edge), axis=0)
     if at.max() > 0.5:
@@ -587,8 +670,13 @@ def choose_remedy(why: str) -> str:
 
 
 def step_time(trials: Sequence[Trial], period_ms: float) -> Promise:
-    """Row "step time": whether steps end within the period, in processor time, which other processes hardly change."""
-    ms = np.sort(np.concatenate([one.result.timing_ms["total"] for one in trials]))
+    """Row "step time": whether steps end within the period, in processor time, which other processes hardly change.
+
+    Steps whose solve failed do not count: they may end early or late.
+    """
+    ms = np.sort(np.concatenate([one.result.timing_ms["total"][one.solved] for one in trials]))
+    if ms.size < 2:
+        return Promise("step time", "not promised", "every solve failed", "See the row on the closed loop.")
     p99, worst = float(np.quantile(ms, 0.99)), float(ms[-1])
     evidence = (
         f"99 % of {ms.size} steps take less than {time_text(p99)} of processor time, the longest {time_text(worst)}; "
@@ -962,15 +1050,19 @@ def examine(
         every.append(trials)
     own = [one for trials in every for one in trials]
     report(len(points), len(points), "margins, limits, observer")
+    fails = failing_loop(points, every)
+    time = step_time([one for one in own if not one.fails] or own, 1e3 * points[0].model.dt)
+    of_model = horizon(points), margins(points, _find_prior_points(kit, tasks))
+    of_observer = process_noise(kit), innovations(tested)
+    if fails is not None:  # rows about settled loops mean nothing beside it
+        return (fails, time, *of_model, *of_observer)
     return (
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
         tasks_end(ends, where),
-        step_time(own, 1e3 * points[0].model.dt),
-        horizon(points),
-        margins(points, _find_prior_points(kit, tasks)),
+        time,
+        *of_model,
         limits(points, own, given_way or {}),
-        process_noise(kit),
-        innovations(tested),
+        *of_observer,
         disturbance_model(points, [trials[0] for trials in every]),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,9 +14,11 @@ from torch import Tensor
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import in_parts
+from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.smooth import Smoother
-from hybrid_mpc.identify.step import Step
+from hybrid_mpc.identify.sound import constant_runs, growth_time
+from hybrid_mpc.identify.step import PriorStep, Step
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
@@ -100,6 +102,70 @@ class Scores(OutputErrors):
 
     e_sim: float
     violation: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RunLength:
+    """Length of the free runs that evaluate models, and why.
+
+    Args:
+        seconds: Length [s]; None: whole recordings.
+        growth: Time [s] in which small errors grow tenfold; infinite if they do not grow.
+        limited: Whether the growth limits the length.
+    """
+
+    seconds: float | None
+    growth: float
+    limited: bool = False
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A warning if the growth limits the length."""
+        return (
+            f"small errors grow tenfold in {self.growth:.2g} s, so long free runs do not compare models. Models are "
+            "trained and compared by free runs of that length; free_run of the DataSpec sets another length",
+        ) if self.limited else ()  # fmt: skip
+
+
+def run_length(
+    make: Callable[..., Prior],
+    fit: PriorFit,
+    train: Sequence[Trajectory],
+    held_out: Sequence[Trajectory],
+    *,
+    dt: float,
+    warm: int,
+    longest: float | None,
+    free_run: float | None = None,
+) -> RunLength:
+    """Length of the free runs of all commands that evaluate models.
+
+    ``free_run`` if it is given. Else whole recordings, unless small errors grow tenfold in less time, and the fitted
+    prior is worse than the training mean in whole free runs: then that time, at least two periods.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        fit: The fit.
+        train: Smoothed training trajectories.
+        held_out: Smoothed trajectories of the other roles; the last role decides: test, else validation.
+        dt: Model period [s].
+        warm: Samples of the warm-up.
+        longest: Length [s] of the longest whole free run; None: no held-out recordings.
+        free_run: Length [s] that the user set (:attr:`DataSpec.free_run`). Default: none.
+    """
+    growth = growth_time(make, fit, [*train, *held_out], dt)
+    if free_run is not None or longest is None or growth >= longest:
+        return RunLength(free_run, growth)
+    prior = make(fit.values)
+    smoother = fit.smoother(prior, dt)
+    judged = [t for t in held_out if t.role == "test"] or held_out
+    runs, spread = evaluation_trajectories(judged, smoother, warm), smoother.sizes.y
+    own = score(free_runs(PriorStep(prior, dt, fit.substeps), prior, runs, warm), prior, spread)
+    mean = [measured_as(prior, y) for y in constant_runs(train, runs, warm + 1)]
+    constant = output_errors(mean, [t.y[warm + 1 :] for t in runs], prior.outputs, spread)
+    if own.error <= constant.error:
+        return RunLength(None, growth)
+    return RunLength(max(growth, 2 * dt), growth, limited=True)
 
 
 def evaluation_trajectories(

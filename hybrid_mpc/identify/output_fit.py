@@ -114,10 +114,10 @@ class OutputFit:
         """Largest number of sub-steps that one of several ``thetas`` ``(m, k)`` requires."""
         return max(self.substeps(one) for one in thetas)
 
-    def reach(self, theta: Array) -> float:
-        """Time [s] in which a small error grows by the larger of ``GROWN`` at ``theta``, along the recordings."""
+    def reach(self, theta: Array, growth: float = GROWN[-1]) -> float:
+        """Time [s] in which a small error grows by ``growth`` at ``theta``, along the recordings. Default: 100."""
         rate = 0.0 if self.points is None else growth_rate(self.make(self.values(theta)), self.points)
-        return math.log(GROWN[-1]) / rate if rate > 0 else math.inf
+        return math.log(growth) / rate if rate > 0 else math.inf
 
     def outputs(
         self, theta: Array, x: Array, windows: OutputWindows, substeps: int, slopes: Slopes

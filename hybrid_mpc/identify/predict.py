@@ -60,9 +60,10 @@ class Prediction:
         outputs: Signals of ``y``.
         t: Times ``(n,)`` [s] in the recording's own time.
         y: Measurement ``(n, n_y)``; NaN where a sample is missing.
-        free_run: Free run from the state after the warm-up, with the measured inputs.
+        free_run: Free runs with the measured inputs; each starts from the state after a warm-up.
         one_step: One-step predictions of the loops' observer; None if the artifact has no observer.
         reason: Why there are no one-step predictions. Default: there are one-step predictions.
+        run_length: Length [s] of the free runs, one behind the other. Default: one run over the recording.
     """
 
     name: str
@@ -73,11 +74,17 @@ class Prediction:
     free_run: Predicted
     one_step: Predicted | None
     reason: str = ""
+    run_length: float | None = None
 
     @property
     def seconds(self) -> float:
         """Length after the warm-up [s]."""
         return len(self.t) * float(self.t[1] - self.t[0])
+
+    @property
+    def title(self) -> str:
+        """Name of the free runs, with their length if it is limited."""
+        return "free run" if self.run_length is None else f"free runs of {self.run_length:.3g} s"
 
     def columns(self) -> dict[str, Array]:
         """Columns ``(n,)`` of a table of the prediction, with units in their names."""
@@ -99,9 +106,11 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     """Compute a free run and one-step predictions of a recording, with bands.
 
     The first ``warm_up`` seconds of the recording determine the initial state (smoothed by the fitted prior) and the
-    networks' hidden state; they are not predicted. The band of the free run was calibrated on validation runs
-    (docs/predict.md). Beyond the longest of these runs, the band grows further without calibration. One-step
-    predictions are those of ``kit.observer(model)``; their band follows from the observer's covariance.
+    networks' hidden state; they are not predicted. Free runs are as long as those that evaluated the model in its run
+    (``free_run`` of the artifact's data specification). Each starts at the end of the one before, with its own warm-up.
+    The band of the free run was calibrated on validation runs (docs/predict.md). Beyond the longest of these runs, the
+    band grows further without calibration. One-step predictions are those of ``kit.observer(model)``; their band comes
+    from the observer's covariance.
 
     Args:
         kit: A loaded artifact.
@@ -125,33 +134,55 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
             f"{(lost + warm + 2) * dt:.4g} s, including a warm-up of {warm * dt:.4g} s [HM-IDENTIFY-041]"
         )
     (acting,) = shifted([trajectory], delay)
+    length = held.data.free_run
+    n = len(acting.t) if length is None else max(1, round(length / dt))
+    begins = range(0, len(acting.t) - warm, n)
+    runs = [acting.part(slice(a, a + warm + n)) for a in begins]
     smoother = Smoother(prior, dt, held.sigma, held.walk, held.sizes, held.fading, held.substeps)
-    (start,) = smoother.smooth([acting.part(slice(0, warm + 1))])
-    shown = slice(warm, None)
-    u, w, t = acting.u[shown], acting.w[shown], acting.t[shown]
-    networks = [*kit.members.values()] if name == "hybrid" else []
-    states = [_free_run(one, trajectory, start.x, lost, warm) for one in (chosen, *networks)]
-    outputs = np.stack([_outputs(prior, x, u, w) for x in states])
-    half = np.full(outputs[0].shape, np.nan)
-    bands = held.bands.get(name)
-    if bands is not None:
-        parameters = parameter_variance(
-            prior, np.array(chosen.covariance), states[0][:1], u[None], w[None], dt, held.substeps
-        )
-        parts = run_variance(
-            outputs[1:] if networks else outputs, parameters[0], t - t[0], np.array(held.sigma), np.array(held.sizes.y),
-            longest=held.longest or np.inf,
-        )  # fmt: skip
-        half = bands.half_width(parts)
-    y = acting.y[shown]
-    free = _predicted(outputs[0], half, y, chosen.outputs, SHARE if bands is None else bands.share)
+    starts = smoother.smooth([run.part(slice(0, warm + 1)) for run in runs])
+    parts = [
+        _banded(kit, name, prior, run, start.x, trajectory.part(slice(a, a + lost + warm + n)))
+        for a, run, start in zip(begins, runs, starts, strict=True)
+    ]
+    outputs, half = (np.concatenate(part) for part in zip(*parts, strict=True))
+    shown, bands = slice(warm, None), held.bands.get(name)
+    y, t = acting.y[shown], acting.t[shown]
+    free = _predicted(outputs, half, y, chosen.outputs, SHARE if bands is None else bands.share)
     one_step, reason = None, ""
     try:
         hat, width = _one_step(kit, name, trajectory.part(slice(lost, None)))
         one_step = _predicted(hat[shown], width[shown], y, chosen.outputs, SHARE)
     except InputError as none:
         reason = str(none)
-    return Prediction(trajectory.name, name, chosen.outputs, t, y, free, one_step, reason)
+    return Prediction(trajectory.name, name, chosen.outputs, t, y, free, one_step, reason, length)
+
+
+def _banded(
+    kit: Kit, name: str, prior: Prior, run: Trajectory, x: Array, commanded: Trajectory
+) -> tuple[Array, Array]:
+    """Outputs of one free run and half widths of its band, both ``(n, n_y)``.
+
+    ``run`` has the inputs that act, ``commanded`` the commanded inputs, from the first that still acts. ``x``
+    ``(warm + 1, n_x)`` are the states of the warm-up.
+    """
+    chosen, held = kit.models[name], kit.predicting
+    assert held is not None
+    warm, lost = len(x) - 1, len(commanded.t) - len(run.t)
+    shown = slice(warm, None)
+    u, w, t = run.u[shown], run.w[shown], run.t[shown]
+    networks = [*kit.members.values()] if name == "hybrid" else []
+    states = [_free_run(one, commanded, x, lost, warm) for one in (chosen, *networks)]
+    outputs = np.stack([_outputs(prior, own, u, w) for own in states])
+    bands = held.bands.get(name)
+    if bands is None:
+        return outputs[0], np.full(outputs[0].shape, np.nan)
+    covariance = np.array(chosen.covariance)
+    parameters = parameter_variance(prior, covariance, states[0][:1], u[None], w[None], run.dt, held.substeps)
+    parts = run_variance(
+        outputs[1:] if networks else outputs, parameters[0], t - t[0], np.array(held.sigma), np.array(held.sizes.y),
+        longest=held.longest or np.inf,
+    )  # fmt: skip
+    return outputs[0], bands.half_width(parts)
 
 
 def _checked(kit: Kit, trajectory: Trajectory, model: str) -> tuple[str, Predicting]:

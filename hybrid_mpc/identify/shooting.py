@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.data.scales import robust_spread, trim_outliers
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.identifiable import Fitted, covariance
-from hybrid_mpc.identify.output_fit import OutputFit, Slopes
+from hybrid_mpc.identify.output_fit import GROWN, OutputFit, Slopes
 from hybrid_mpc.identify.prior_result import Combination
 from hybrid_mpc.identify.windows import OutputWindows
 
@@ -168,13 +168,14 @@ class Shooting:
     def _growing(self, thetas: Sequence[Array]) -> list[int]:
         """Increasing lengths [periods] over which initial states are estimated before the whole windows.
 
-        Empty unless small errors grow by more than a factor of 100 in a window. Each estimate is the start of the next.
+        Empty unless small errors grow more than tenfold in a window. Each estimate is the start of the next. (Over a
+        window that multiplies errors by 100, Gauss-Newton from a smoothed state of a wrong prior ends far away.)
         """
-        periods, dt = self.windows.y.shape[1] - 1, self.own.dt
-        reach = min(self.own.reach(theta) for theta in thetas) / dt
-        if self.windows.warm or 0.8 * periods <= reach:
+        periods = self.windows.y.shape[1] - 1
+        tenfold = min(self.own.reach(theta, GROWN[0]) for theta in thetas) / self.own.dt
+        if self.windows.warm or 0.8 * periods <= tenfold:
             return []
-        return [int(own) for own in np.arange(max(reach, 4.0), periods, max(0.5 * reach, 2.0))]
+        return [int(own) for own in np.arange(max(tenfold, 4.0), periods, max(tenfold, 2.0))]
 
     def first_states(self, theta: Array) -> Array:
         """Best initial states ``(n, n_x)`` for ``theta``."""

@@ -320,8 +320,9 @@ def _substeps(rate: float, dt: float, name: str, where: str) -> int:
     if substeps > MAX_SUBSTEPS:
         raise InputError(
             f"{name}: too stiff. Its fastest mode {where} is {rate:.3g} 1/s, so a period of {dt} s would need "
-            f"{rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Smooth its friction (lower the slope at zero speed), "
-            f"or use a smaller dt [HM-IDENTIFY-049]"
+            f"{rate * dt:.3g} sub-steps (at most {MAX_SUBSTEPS}). Replace its fastest "
+            "state by its steady-state equation, smooth a steep term (dry friction at zero speed), or use a smaller dt "
+            "[HM-IDENTIFY-049]"
         )
     return substeps
 

@@ -33,6 +33,8 @@ STILL = 0.01
 DECADES = (-6.0, 2.0)
 """Searched range of the walk of the unexplained rates, as a power of ten of their natural size: from an exact prior to
 a prior that explains nothing."""
+PIVOT = 1e-14
+"""Smallest pivot of a matrix of correlations; rounding alone makes some 1e-16."""
 AT_ONCE, NARROW = 15, 0.1
 """Number of walks that are tried at once, and the resolution [powers of ten] at which the search ends."""
 ALIKE = 0.5
@@ -198,10 +200,7 @@ class Smoother:
             e = found.e.reshape(m, b, *found.e.shape[1:])
             seen = np.where(found.counted[:b], e[0], np.nan)
             own |= {i: v[:n] for i, v, n in zip(group, seen, runs.lengths, strict=True)}
-            root = np.linalg.cholesky(
-                np.where(runs.inside[..., None, None], found.s[:b], np.eye(e.shape[-1]))
-            )
-            scaled = np.linalg.solve(root, e[..., None])[..., 0]
+            scaled = _whitened(e, found.s[:b])[0]
             every.append(np.asarray(scaled[:, runs.inside].reshape(m, -1), dtype=np.float64))
         return np.concatenate(every, axis=1), [own[i] for i in range(len(trajectories))]
 
@@ -341,6 +340,28 @@ class _Filtered:
     s: Array
 
 
+def _whitened(e: Array, s: Array) -> tuple[Array, Array]:
+    """Errors ``(..., n_y)`` over the Cholesky root of their covariances ``(..., n_y, n_y)``, and the log-determinants.
+
+    With ``s = D C D``, ``D`` the standard deviations and ``C = L L'`` the correlations: ``L^-1 D^-1 e``. Pivots of
+    ``C`` are at least :data:`PIVOT`: where a filter diverges, rounding makes ``s`` singular. Numbers that are
+    not finite stay.
+    """
+    n = e.shape[-1]
+    with np.errstate(all="ignore"):
+        size = np.sqrt(np.diagonal(s, axis1=-2, axis2=-1))
+        c, white = s / (size[..., :, None] * size[..., None, :]), e / size
+        root = np.zeros_like(c)
+        for j in range(n):
+            rest = c[..., j:, j] - (root[..., j:, :j] @ root[..., j, :j, None])[..., 0]
+            pivot = np.sqrt(np.maximum(rest[..., :1], PIVOT))
+            root[..., j:, j] = np.concatenate([pivot, rest[..., 1:] / pivot], axis=-1)
+            known = np.sum(root[..., j, :j] * white[..., :j], axis=-1)
+            white[..., j] = (white[..., j] - known) / root[..., j, j]
+        logs = 2.0 * np.sum(np.log(size * np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
+    return white, logs
+
+
 def _innovations(
     smoothers: Sequence[Smoother], trajectories: Sequence[Trajectory]
 ) -> list[tuple[float, float, int]]:
@@ -356,11 +377,13 @@ def _innovations(
         found = one._filtered(runs.times(m), levels=levels)
         skip = np.minimum(math.ceil(one._n_z / max(1, len(one.sigma))), np.array(runs.lengths) - 1)
         counts = runs.inside & (np.arange(runs.y.shape[1]) >= skip[:, None])
-        e, s, counted = (v.reshape(m, b, *v.shape[1:])[:, counts] for v in (found.e, found.s, found.counted))
-        squares += np.sum(e * np.linalg.solve(s, e[..., None])[..., 0], axis=(1, 2))
-        # a diverged filter has no determinant; its cost is not finite, so it is not selected
-        with np.errstate(invalid="ignore"):
-            logs += np.linalg.slogdet(s)[1].sum(axis=1)
+        e, s = (v.reshape(m, b, *v.shape[1:])[:, counts] for v in (found.e, found.s))
+        counted = found.counted.reshape(m, b, *found.counted.shape[1:])[:, counts]
+        white, logarithms = _whitened(e, s)
+        # the cost of a diverged filter is not finite or large, so it is not selected
+        with np.errstate(invalid="ignore", over="ignore"):
+            squares += np.sum(np.square(white), axis=(1, 2))
+            logs += logarithms.sum(axis=1)
         count += counted.sum(axis=(1, 2))
     return [(float(a), float(b), int(c)) for a, b, c in zip(squares, logs, count, strict=True)]
 

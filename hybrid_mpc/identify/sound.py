@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.choose import recommend
 from hybrid_mpc.identify.fit import LENGTHS
 from hybrid_mpc.identify.fit_warnings import AT_BOUND
 from hybrid_mpc.identify.output_fit import GROWN, OutputFit
@@ -139,7 +140,7 @@ def growth_time(
     """Time [s] in which small errors grow tenfold along the recordings; infinite if they do not grow."""
     own = OutputFit(make, dt)
     own.points = visited(smoothed)
-    return own.reach(own.scaled(fit.values)) * math.log(GROWN[0]) / math.log(GROWN[-1])
+    return own.reach(own.scaled(fit.values), GROWN[0])
 
 
 def trial_length(
@@ -282,6 +283,41 @@ def warn_of_worse_outputs(nominal: Mapping[str, float], fitted: Mapping[str, flo
         "parameters"
         for name, error in nominal.items()
         if math.isfinite(error) and fitted[name] > WORSE * error
+    )
+
+
+def warn_of_worse_fit(
+    nominal: Sequence[Array], fitted: Sequence[Array], recordings: Sequence[str], samples: int = 1
+) -> tuple[str, ...]:
+    """A warning if the nominal parameters are significantly better than the fitted ones on the same test runs.
+
+    The statistics are those of the choice of a model (:func:`~hybrid_mpc.identify.choose.recommend`).
+
+    Args:
+        nominal: Squared errors of each run ``(n,)`` [-] with nominal parameters.
+        fitted: The same with fitted parameters.
+        recordings: Recording of each run.
+        samples: Minimum samples of a block; errors within a block are correlated. Default: 1.
+
+    Example:
+        >>> own = [np.full(50, size) for size in (0.9, 1.0, 1.1, 1.0)]
+        >>> len(warn_of_worse_fit(own, [1.4 * one for one in own], ["a", "b", "c", "d"]))
+        1
+        >>> warn_of_worse_fit(own, own[::-1], ["a", "b", "c", "d"])
+        ()
+    """
+    found = recommend(
+        {"fitted": fitted, "nominal": nominal}, prior="fitted", samples=samples, recordings=recordings
+    )
+    own = found.candidates["nominal"]
+    if "nominal" not in found.sure or own.ratio > COSTLY:
+        return ()
+    return (
+        f"on the test recordings the error with nominal parameters is {own.ratio:.2f} times that with fitted ones "
+        f"(upper bound {own.upper:.2f}; {found.blocks} {'recordings' if len(set(recordings)) > 1 else 'blocks'}). The "
+        "training recordings lack the motion of the test recordings, or an effect that the prior lacks biases the fit. "
+        "Record more like the test recordings, search the effect with 'hybrid-mpc explain', or keep known values: "
+        "Parameter(..., fixed=True), or narrower bounds [HM-IDENTIFY-084]",
     )
 
 

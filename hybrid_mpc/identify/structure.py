@@ -443,8 +443,7 @@ def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[fl
     If small errors grow fast, there is a shorter length: twice the time in which they grow tenfold (initial states are
     free). The longest one is used too, because the mistake may cause the growth.
     """
-    tenfold = math.log(GROWN[0]) / math.log(GROWN[-1])
-    shorter = max(4 * fit.dt, 2 * tenfold * min(fit.reach(theta) for theta in thetas))
+    shorter = max(4 * fit.dt, 2 * min(fit.reach(theta, GROWN[0]) for theta in thetas))
     # ratio of a shorter to a longer length above which only the longer one is used
     return [shorter, longest] if shorter < 0.7 * longest else [longest]
 

@@ -193,6 +193,16 @@ def tuned_noise(
     return scaled(choose_most_likely(filter_of, parts, (1.0, 3.0)))
 
 
+def _ask_for_point(model: HybridModel) -> str:
+    """Remedy for a failed rank test at a point that the prior does not declare; empty if it does."""
+    if model.x0.any() or model.u0.any():
+        return ""
+    return (
+        "All states and inputs are zero there: declare the point at which the machine works in the prior, "
+        "operating_point = OperatingPoint(x=(...), u=(...)). "
+    )
+
+
 def make_estimator(
     model: HybridModel,
     scenario: LoopAssumptions,
@@ -234,7 +244,8 @@ def make_estimator(
     first, span = first_deviations(model, scenario), disturbance_sizes(model, control)
     if observer and not (found := distinguishable(model, Sizes(model, control).states)).detectable:
         raise InputError(
-            f"observer of model {model.name}: at the operating point {found.why_undetectable}. Declare other "
+            f"observer of model {model.name}: at the operating point {found.why_undetectable}. {_ask_for_point(model)}"
+            "Declare other "
             'disturbances, at most as many as outputs: Scenario(disturbance_model=(Disturbance("output", ...), ...)) '
             "[HM-KIT-012]"
         )
@@ -399,7 +410,10 @@ def make_controller(
     if control.n_y == prior.n_y and 0 < np.count_nonzero(control.q_y) <= prior.n_u:
         found = offset_free(prior, np.flatnonzero(control.q_y).tolist())
         if not found.reachable:
-            raise InputError(f"control problem: at the operating point {found.why_unreachable} [HM-KIT-017]")
+            raise InputError(
+                f"control problem: at the operating point {found.why_unreachable}. "
+                f"{_ask_for_point(prior)}[HM-KIT-017]"
+            )
     if iterations is not None and solver == "native":
         raise InputError(
             "iterations: solver native always linearizes once a period. Omit iterations, or use rti, sqp or ipopt "

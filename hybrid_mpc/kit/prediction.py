@@ -52,7 +52,7 @@ class Predicting:
     """Settings that predictions of a recording need besides the models.
 
     Args:
-        data: How recordings are read.
+        data: How recordings are read; its ``free_run`` is the length of the run's free runs.
         corrects: States whose rates a network may correct.
         sigma: Sensor noise of the warm-up's smoother [output units].
         walk: Standard deviation of the change per period of each unexplained rate in the smoother.

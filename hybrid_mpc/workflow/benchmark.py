@@ -226,6 +226,19 @@ class BenchmarkContext(Context):
         return spec.length or spec.piece
 
     @property
+    def run_length(self) -> float | None:
+        """Length [s] of free runs: that of the benchmark, else that of its fit; None: whole recordings."""
+        return benchmark_of(self.scenario).length or self.prior.longest_run
+
+    def cut(self, over: Sequence[Trajectory], warm_up: float, repeated: bool = False) -> Sequence[Trajectory]:
+        """Trajectories cut into free runs after a warm-up of ``warm_up`` [s], if the runs repeat or errors grow."""
+        given, dt, length = benchmark_of(self.scenario).length, self.spec.dt, self.run_length
+        if length is None or not (repeated or given is None):
+            return over
+        # two more samples than warm-up and evaluated length: the last input, and the sample that it leads to
+        return in_runs(over, round(warm_up / dt) + round(length / dt) + 2)
+
+    @property
     def dataset(self) -> Dataset:
         """The training recordings. Held-back pieces have the role of the test; without them, validation pieces do."""
         assert self.recordings is not None
@@ -287,7 +300,8 @@ def candidate_errors(
     """Errors of every model's free runs after a warm-up of ``warm_up`` [s]."""
     spec, fit = benchmark_of(context.scenario), context.prior.fit
     prior = context.scenario.prior(fit.values)
-    runs = run_freely(prior, fit, networks, trajectories, warm_up=warm_up, length=spec.length, linear=linear)
+    over, length = context.cut(trajectories, warm_up), context.run_length
+    runs = run_freely(prior, fit, networks, over, warm_up=warm_up, length=length, linear=linear)
     return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
 
 
@@ -480,14 +494,11 @@ def _evaluate(
     spec, outputs, hybrid = benchmark_of(scenario), scenario.prior().outputs, choice.choice.recommended
 
     def runs_of(fit: PriorFit, over: Sequence[Trajectory]) -> list[BenchmarkRun]:
-        warm_up = context.spec.warm_up
-        if spec.repeated and spec.length is not None:
-            # two more samples than warm-up and evaluated length: the last input, and the sample that it leads to
-            over = in_runs(over, round(warm_up / dt) + round(spec.length / dt) + 2)
-        prior = scenario.prior(fit.values)
+        warm_up, prior = context.spec.warm_up, scenario.prior(fit.values)
         return run_freely(
-            prior, fit, networks, over, warm_up=warm_up, length=spec.length, linear=choice.linear
-        )
+            prior, fit, networks, context.cut(over, warm_up, spec.repeated), warm_up=warm_up,
+            length=context.run_length, linear=choice.linear,
+        )  # fmt: skip
 
     runs = runs_of(old, trajectories)
     names = {**{m: m for m in ("phy", *networks)}, "hybrid": hybrid, **{m: m for m in choice.linear}}
@@ -584,4 +595,6 @@ def table(results: BenchmarkResults) -> list[str]:
     lines += [
         f"{kind}: {100 * share:.0f} % of its correction" for kind, share in shares.items() if share != 1
     ]
+    length = results.prior.longest_run
+    lines += [] if length is None else [f"free runs of {length:.3g} s"]
     return [*lines, f"hybrid: {results.hybrid}"]

@@ -126,7 +126,7 @@ def tests_table(found: ExplainResult) -> Table:
             (MODELS[name], one.error, *(one.rmse[label] for label in labels))
             for name, one in found.tests.items()
         ],
-        "Free runs over the test recordings, which neither fit nor search use.",
+        f"{found.tests_title.capitalize()}, which neither fit nor search use.",
     )
 
 

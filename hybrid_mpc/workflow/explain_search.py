@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.data.trajectories import Dataset
@@ -32,6 +32,9 @@ from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explained import ExplainResult, FreeRuns, explained_name
 from hybrid_mpc.workflow.stage import sources
 from nn_export.program import to_json
+
+if TYPE_CHECKING:
+    from hybrid_mpc.identify.evaluate import RunLength
 
 
 def prior_class(scenario: Scenario) -> type[Prior]:
@@ -122,7 +125,7 @@ class Search:
         self.out, self.most = out, most
         self.dt = context.spec.dt
         self.train, self.valid, self.test = (list(data.by_role(role)) for role in ("train", "valid", "test"))
-        self.length = context.spec.free_run or max(
+        self.longest = context.spec.free_run or max(
             (len(t.t) - context.warm) * self.dt for t in (*self.valid, *self.test)
         )
         programs = prior_programs(extended(make, *chosen.own)(), self.dt)
@@ -140,11 +143,14 @@ class Search:
         for warning in fit.warnings:
             progress.warn(f"fit of the prior: {warning}")
         progress.finish("")
-        explanation = self.searched(fit)
+        length = self.run_length(fit)
+        for warning in length.warnings:
+            progress.warn(warning)
+        explanation = self.searched(fit, length.seconds or self.longest)
         tests: dict[str, FreeRuns] = {}
         if self.test:
             progress.start("free runs over the test recordings")
-            tests = self.tests(fit, explanation)
+            tests = self.tests(fit, explanation, length.seconds)
             progress.finish("")
         name = self.context.scenario.name
         own = fit.smoother(self.make(fit.values), self.dt)
@@ -158,6 +164,7 @@ class Search:
             floor,
             tests,
             f"{explained_name(name)}.py" if explanation.found else "",
+            length.seconds,
         )
 
     def fit(self) -> PriorFit:
@@ -166,17 +173,28 @@ class Search:
         if held is not None:
             return record(PriorFit, held, "the fit")
         fit = fit_prior(
-            self.make, self.train, self.valid, dt=self.dt, length=self.length,
+            self.make, self.train, self.valid, dt=self.dt, length=self.longest,
             largest_delay=self.context.spec.largest_delay, time_unit=time_unit(self.train, self.dt),
             on_progress=self._progress("free runs"),
         )  # fmt: skip
         self._keep("fit", fit)
         return fit
 
-    def searched(self, fit: PriorFit) -> Explanation:
-        """Result of the search; an interrupted search continues after its last saved step."""
+    def run_length(self, fit: PriorFit) -> RunLength:
+        """Length of the free runs that evaluate models, as in a run."""
+        from hybrid_mpc.identify.evaluate import run_length
+
+        every = smoothed(self.make, fit, [*self.train, *self.valid, *self.test], self.dt)
+        n = len(self.train)
+        return run_length(
+            self.make, fit, every[:n], every[n:], dt=self.dt, warm=self.context.warm, longest=self.longest,
+            free_run=self.context.spec.free_run,
+        )  # fmt: skip
+
+    def searched(self, fit: PriorFit, length: float) -> Explanation:
+        """Result of the search by free runs of ``length`` [s]; an interrupted one continues after its last step."""
         known_ = smoothed(self.make, fit, [*self.train, *self.valid], self.dt)
-        candidates = self.chosen.candidates(self.make(fit.values), visited(known_), self.dt, self.length)
+        candidates = self.chosen.candidates(self.make(fit.values), visited(known_), self.dt, length)
         done = self._held("search")
         if done is not None:
             return record(Explanation, done, "the search")
@@ -196,7 +214,7 @@ class Search:
                 progress.start(f"search, step {1 + _added(explanation)}")
 
         found = search(
-            self.make, fit.values, known_, dt=self.dt, length=self.length, warm_up=self.context.spec.warm_up,
+            self.make, fit.values, known_, dt=self.dt, length=length, warm_up=self.context.spec.warm_up,
             candidates=candidates, own=self.chosen.own, begun=begun, most=self.most,
             on_progress=self._progress("candidates"), on_step=keep,
         )  # fmt: skip
@@ -204,12 +222,15 @@ class Search:
         self._keep("search", found)
         return found
 
-    def tests(self, fit: PriorFit, explanation: Explanation) -> dict[str, FreeRuns]:
-        """Errors over the test recordings; each model starts from the states of its own smoother."""
+    def tests(self, fit: PriorFit, explanation: Explanation, length: float | None) -> dict[str, FreeRuns]:
+        """Errors over the test recordings, in free runs of ``length`` [s]; None: whole recordings.
+
+        Each model starts from the states of its own smoother.
+        """
         from hybrid_mpc.identify.evaluate import evaluation_trajectories, free_runs, score
         from hybrid_mpc.identify.step import PriorStep
 
-        warm, spec = self.context.warm, self.context.spec
+        warm = self.context.warm
         fitted, acting = self.make(fit.values), shifted([*self.train, *self.valid], fit.delay)
         own = fit.smoother(fitted, self.dt)
         models = {"fitted": (fitted, own)}
@@ -225,7 +246,7 @@ class Search:
         steps = {"nominal": (PriorStep(self.make(), self.dt), fitted, own)}
         steps |= {name: (PriorStep(p, self.dt, s.substeps), p, s) for name, (p, s) in models.items()}
         for name, (step, prior, smoother) in steps.items():
-            runs = evaluation_trajectories(smoother.smooth(test), smoother, warm, spec.free_run)
+            runs = evaluation_trajectories(smoother.smooth(test), smoother, warm, length)
             errors = score(free_runs(step, prior, runs, warm), prior, own.sizes.y)
             found[name] = FreeRuns(errors.error, errors.rmse)
         return found

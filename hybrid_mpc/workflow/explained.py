@@ -43,6 +43,7 @@ class ExplainResult:
         tests: Errors over the test recordings by model: ``"nominal"``, ``"fitted"``, ``"explained"``. Empty without
             test recordings.
         file: Name of the scenario file with the found terms; empty without a found term.
+        run_length: Length [s] of the free runs over the test recordings. Default: whole recordings.
     """
 
     scenario: str
@@ -51,6 +52,13 @@ class ExplainResult:
     floor: float
     tests: Mapping[str, FreeRuns] = field(default_factory=dict)
     file: str = ""
+    run_length: float | None = None
+
+    @property
+    def tests_title(self) -> str:
+        """Title of the table of ``tests``."""
+        length = "" if self.run_length is None else f" of {self.run_length:.3g} s"
+        return f"free runs{length} over the test recordings"
 
 
 def explained_name(scenario: str) -> str:

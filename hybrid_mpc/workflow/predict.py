@@ -85,7 +85,7 @@ def predict_recordings(
         one = predict(kit, trajectory, model)
         name = trajectory.name.replace("#", "_")
         write_csv(out / f"{name}.csv", one.columns())
-        runs = {"free run": one.free_run, "one step ahead": one.one_step}
+        runs = {one.title: one.free_run, "one step ahead": one.one_step}
         bands = {label: (run.y_hat, run.half_width) for label, run in runs.items() if run is not None}
         figure = prediction(
             one.t, one.y, bands, outputs=one.outputs, model=one.model, title=f"{name}: {one.model}"
@@ -94,8 +94,8 @@ def predict_recordings(
         found.append(one)
     figures = [
         {
-            "recording": one.name, "seconds": one.seconds, "free_run": one.free_run, "one_step": one.one_step,
-            "reason": one.reason,
+            "recording": one.name, "seconds": one.seconds, "run_length": one.run_length,
+            "free_run": one.free_run, "one_step": one.one_step, "reason": one.reason,
         }
         for one in found
     ]  # fmt: skip

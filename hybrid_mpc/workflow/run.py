@@ -116,16 +116,19 @@ def run(
             ahead = [
                 s.name for s in STAGES[i:] if s.name not in (*skip, *without) and (not only or s.name in only)
             ]
-            context.progress.start(stage.title + remaining(took, ahead))
+            told = stage.name not in without  # a stage that is not part of this run does not begin
+            if told:
+                context.progress.start(stage.title + remaining(took, ahead))
             begun = time.monotonic()
             if only and stage.name not in (*only, *ALWAYS):
-                context.progress.finish(_as_it_is(context, stage, only))
+                said = _as_it_is(context, stage, only)
             else:
                 said = bring_up_to_date(context, stage, stage.name in skip)
                 if not said and stage in (PRIOR, TRAINING, EVALUATION):
                     report_so_far(context)
-                if not said and stage.name not in without:
+                if not said and told:
                     took[stage.name] = time.monotonic() - begun
+            if told:
                 context.progress.finish(said)
     return read_results(out / "results.json")
 

@@ -118,5 +118,5 @@ def test_a_doubt_that_a_missing_term_explains_names_the_search(call, machine, mo
     monkeypatch.setattr(check, "_fit", lambda *given: ((), (), ("k ends at its bound",), lacking))
     code, told, _ = call("check", machine / "my_machine.py", "--data", machine / "monday.csv", "--fit")
     assert code == 0
-    assert ("hybrid-mpc explain" in told) == bool(lacking)
+    assert (f"hybrid-mpc explain {machine / 'my_machine.py'} " in told) == bool(lacking)
     assert (str(machine / "monday.csv") in told.splitlines()[-1]) == bool(lacking)

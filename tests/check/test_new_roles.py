@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, load_scenario, write_csv
-from hybrid_mpc.check.first_model import Runs, first_lag, slowest
+from hybrid_mpc.check import first_model
+from hybrid_mpc.check.first_model import Runs, first_lag, growth_of, slowest
 from hybrid_mpc.check.new import horizon_of, left_to_decide, write_scenario
 from hybrid_mpc.check.roles import Trait, copy_of, follows, is_rate, judge_roles
 from hybrid_mpc.data.names import role_said_by, unit_behind
@@ -106,6 +107,31 @@ def test_the_growth_of_an_unstable_machine(tmp_path):
     assert draft.loop
     said = [line for line in left_to_decide(tmp_path / "m.py") if "closed loop" in line or "unstable" in line]
     assert len(said) == 2
+
+
+def levitated(seed, noise, dt=1e-3):
+    """Gap, current and voltage of a ball below a magnet, which leaves its rest with 40 1/s, under two controllers."""
+    rng, x, v, i, smooth, reference, rows = np.random.default_rng(seed), 0.0, 0.0, 0.0, 0.0, 0.0, []
+    for k in range(20_000):
+        gap, current = x + noise * rng.normal(), i + 0.15 * noise * rng.normal()
+        reference = rng.uniform(-1.0, 1.0) if k % 500 == 0 else reference
+        smooth, before = smooth + (gap - smooth) / 3.0, smooth
+        wanted = 0.34 * (gap - reference) + 7e-3 * (smooth - before) / dt
+        voltage = 65.0 * (wanted - current) + 11.0 * wanted + 0.3 * rng.normal()
+        rows.append((gap, current, voltage))
+        for _ in range(4):
+            h, a = dt / 4, 1600.0 * (x - 4.5 * i)
+            x, v, i = x + h * v, v + h * a, i + h * (voltage - 11.0 * i) / 0.3
+    table = np.array(rows)
+    return Runs(table[:, :2], table[:, 2:])
+
+
+def test_the_growth_of_a_machine_whose_noise_exceeds_the_motion_of_a_sample(monkeypatch):
+    runs = [levitated(seed, 0.025) for seed in range(2)]
+    # noise reduces the rate of the fitted poles
+    assert growth_of(runs, 1e-3) == pytest.approx(40.0, rel=0.4)
+    monkeypatch.setattr(first_model, "FINEST", (1,))
+    assert growth_of(runs, 1e-3) == 0.0
 
 
 def test_a_carriage_with_friction_is_not_unstable(tmp_path):

@@ -184,6 +184,26 @@ def test_loads_act_where_the_disturbance_model_says(where):
     assert found.result.d[-50:, 0].mean() == pytest.approx(p.loads(point, 0)[0], abs=0.1 * size)
 
 
+def failing(a, b, limit, level):
+    problem = OCP(20, [0.0], [0.0], [0.1], [-limit], [limit], q_y=[10.0])
+    point = point_of(kit_of(tank(a=a, b=b), problem), hold(level))
+    trials = [p.trial(point, draw, 120) for draw in range(2)]
+    return trials, p.failing_loop([point], [trials])
+
+
+def test_a_loop_that_fails_is_one_row_with_the_cause():
+    trials, row = failing(1.3, 0.1, 1.0, 0.5)  # the valve cannot hold the load
+    assert (row.name, row.verdict) == ("closed loop", "not promised")
+    assert "level is far beyond its range" in row.evidence
+    assert "input does not hold the machine" in row.remedy
+    solved = sum(int(one.solved.sum()) for one in trials)
+    assert 0 < solved < sum(len(one.solved) for one in trials)
+    assert f"of {solved} steps" in p.step_time(trials, 100.0).evidence  # failed solves do not count
+    _, row = failing(2.5, 0.3, 50.0, 0.0)  # errors grow by 2.5^20 over the horizon
+    assert "8 periods" in row.remedy  # 3 ln 10 / ln 2.5 = 7.5
+    assert failing(1.3, 0.1, 1.0, 0.0)[1] is None
+
+
 # Every other promise, broken once.
 
 
@@ -272,6 +292,24 @@ def test_a_hard_bound_that_no_plan_keeps_is_a_doubt():
     assert p.limits([kept], [], {}).verdict == "shown"
     told = p.limits([kept], [], {"hold": {"level": 0.02}})
     assert (told.verdict, "2 % of the periods" in told.evidence) == ("doubted", True)
+
+
+def test_a_loop_that_leaves_its_ranges_gives_one_row_and_a_horizon_that_holds_it():
+    """An unstable machine with a horizon over which errors grow 10^10 times: every solve fails."""
+    unstable, weights = tank(a=1.5), ([0.0], [0.0], [0.1], [-1.0], [1.0])
+    end = p.TaskEnd("hold", (p.Deviation(LEVEL, 0.01, 0.0, 0.01),))
+    failing = p.examine(
+        kit_of(unstable, OCP(60, *weights, q_y=[10.0])), [hold(0.0)], ends=(end,), tested=WHITE
+    )
+    found = {row.name: row for row in failing}
+    assert found["closed loop"].verdict == "not promised"
+    assert "first failed solve after 0 s" in found["closed loop"].evidence
+    assert not {"no offset", "limits", "disturbance model", "set-points of the tasks"} & set(found)
+    assert found["step time"].verdict == "not promised"
+    (periods,) = re.findall(r"(\d+) periods", found["closed loop"].remedy)
+    shorter = p.examine(kit_of(unstable, OCP(int(periods), *weights, q_y=[10.0])), [hold(0.0)], tested=WHITE)
+    assert "closed loop" not in verdicts(shorter)
+    assert verdicts(shorter)["limits"] == "shown"
 
 
 def test_noise_beyond_the_spread_and_innovations_that_tell_of_each_other_are_doubts():

@@ -162,8 +162,12 @@ def test_an_observer_whose_disturbances_nobody_can_tell_is_refused():
     ocp = OCP(5, [1, 1], [1], [1], [0.0], [4e-4])
     assert make_estimator(two_tanks(), machine, np.array([1e-4, 1e-4]), ocp).model.n_d == 1
     both = two_tanks(disturbance_model=(Disturbance("input", "pump"), Disturbance("output", "lower", 0.1)))
-    with pytest.raises(InputError, match="HM-KIT-012"):
+    with pytest.raises(InputError, match="HM-KIT-012") as declared:
         make_estimator(both, machine, np.array([1e-4, 1e-4]), ocp)
+    assert "operating_point" not in str(declared.value)
+    nowhere = replace(both, nominal_x=(), nominal_u=())
+    with pytest.raises(InputError, match=r"operating_point = .*HM-KIT-012"):
+        make_estimator(nowhere, machine, np.array([1e-4, 1e-4]), ocp)
     make_estimator(both, machine, np.array([1e-4, 1e-4]), ocp, observer=False)
 
 

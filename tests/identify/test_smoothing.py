@@ -14,7 +14,7 @@ from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Prior, Signal
 from hybrid_mpc.data.differentiate import local_polynomial
 from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.identify.simulation import Simulation
-from hybrid_mpc.identify.smooth import IGNORANCE, Smoother, sizes_of, unseen_states
+from hybrid_mpc.identify.smooth import IGNORANCE, Smoother, _whitened, sizes_of, unseen_states
 from tests.simulated_pendulum import DT, TRUTH, Pendulum, record
 
 SIGMA = 1e-3
@@ -467,3 +467,19 @@ def test_sizes_follow_the_units():
     other = sizes_of(Millimetres(TANKS), scaled, 0.5, 10.0)
     for name in ("y", "noise", "x", "rate"):
         np.testing.assert_allclose(getattr(other, name), 1e3 * np.array(getattr(sizes, name)), rtol=1e-9)
+
+
+def test_errors_are_whitened_where_a_diverged_filter_makes_their_covariance_singular():
+    """Covariances as those of a boat's filter at a walk far too large: rounding leaves them rank one."""
+    rng = np.random.default_rng(0)
+    e, roots = rng.normal(size=(2, 5, 3)), rng.normal(size=(5, 3, 3))
+    s = roots @ roots.swapaxes(1, 2) * np.outer([1e-3, 1.0, 1e4], [1e-3, 1.0, 1e4])
+    white, logs = _whitened(e, s)
+    wanted = np.linalg.solve(np.linalg.cholesky(s), e[..., None])[..., 0]
+    np.testing.assert_allclose(white, wanted, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(logs, np.linalg.slogdet(s)[1], rtol=1e-12)
+    deviations = np.array([2.0**175, 2.0**187, 2.0**149])
+    white, logs = _whitened(e[0, :1], np.outer(deviations, deviations)[None])
+    assert np.isfinite(white).all()
+    assert np.isfinite(logs).all()
+    assert np.isnan(_whitened(e[0, :1], np.full((1, 3, 3), np.nan))[1]).all()

@@ -15,6 +15,7 @@ from hybrid_mpc.identify.sound import (
     constant_runs,
     problems,
     structure_doubt,
+    warn_of_worse_fit,
 )
 
 SECONDS = 1.0
@@ -120,3 +121,15 @@ def test_a_simpler_model_that_is_clearly_better_puts_the_structure_in_doubt(erro
     found = structure_doubt(error, baselines)
     assert bool(found) == bool(doubted)
     assert doubted in found
+
+
+@pytest.mark.parametrize(
+    ("factors", "warned"),
+    [((1.5, 1.6, 1.4, 1.5), True), ((4.0, 0.5, 1.2, 0.6), False), ((1.02, 1.02, 1.02, 1.02), False)],
+    ids=["worse", "in some recordings", "hardly"],
+)
+def test_a_fit_that_is_surely_worse_than_nominal_values_is_named(factors, warned):
+    nominal = [np.full(50, size) for size in (0.9, 1.0, 1.1, 1.0)]
+    fitted = [factor * own for factor, own in zip(factors, nominal, strict=True)]
+    found = warn_of_worse_fit(nominal, fitted, ["a", "b", "c", "d"])
+    assert ["HM-IDENTIFY-084" in one for one in found] == [True] * warned

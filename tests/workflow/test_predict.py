@@ -50,6 +50,23 @@ def test_free_run_and_band_are_those_of_the_run(bare_tanks, model):
             assert np.abs(found.free_run.half_width / band - 1).max() < 1e-6
 
 
+def test_predictions_are_free_runs_of_the_length_of_the_run(bare_tanks, model):
+    """Each has its own warm-up: it is the free run over a part of the recording."""
+    kit = load(model)
+    spec, recording = kit.predicting.data, whole(kit, bare_tanks / "later.csv")
+    n, warm = 40, round(spec.warm_up / spec.dt)
+    short = replace(kit, predicting=replace(kit.predicting, data=replace(spec, free_run=n * spec.dt)))
+    for name in ("prior", "hybrid"):
+        found = predict(short, recording, name)
+        assert found.run_length == n * spec.dt
+        assert len(found.t) == len(recording.t) - warm
+        for part in (0, 2):
+            own = predict(kit, recording.part(slice(part * n, part * n + warm + n)), name).free_run
+            shown = slice(part * n, (part + 1) * n)
+            np.testing.assert_allclose(found.free_run.y_hat[shown], own.y_hat, atol=1e-12)
+            np.testing.assert_allclose(found.free_run.half_width[shown], own.half_width, rtol=1e-9)
+
+
 def test_a_longer_run_than_those_of_the_calibration_has_a_wider_band(bare_tanks, model):
     kit = load(model)
     found = predict(kit, whole(kit, bare_tanks / "later.csv"), "prior")

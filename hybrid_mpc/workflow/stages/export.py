@@ -140,7 +140,7 @@ def predicting(context: Context, phy: Prior) -> Predicting | None:
         return None
     bands = {name: chosen.bands[key] for name, key in (("prior", "phy"), ("hybrid", chosen.deployed))}
     return Predicting(
-        data=replace(context.spec, windows={}),
+        data=replace(context.spec, windows={}, free_run=context.prior.longest_run),
         corrects=tuple(phy.states[i].name for i in phy.corrected),
         sigma=fit.sigma,
         walk=fit.walk,

@@ -26,6 +26,7 @@ from hybrid_mpc.identify.evaluate import (
     free_runs,
     measured_as,
     output_errors,
+    run_length,
     score,
     stacked_free_runs,
 )
@@ -43,11 +44,11 @@ from hybrid_mpc.identify.sound import (
     constant_runs,
     correlation_of_errors,
     fit_doubt,
-    growth_time,
     no_gain,
     problems,
     structure_doubt,
     trial_length,
+    warn_of_worse_fit,
     warn_of_worse_outputs,
 )
 from hybrid_mpc.identify.starts import POOR
@@ -328,21 +329,22 @@ def examined_prior(context: Context) -> PriorResult:
         context.progress.warn(f"fit of the prior: {warning}")
     unseen = every[len(train) + len(valid) :]
     judge, linear = _Judge(context, fitted, fit, smoother), linear_models(context)
-    longest_run = spec.free_run
-    errors, baselines = judge.errors(unseen, longest_run, linear)
-    growth: tuple[str, ...] = ()
-    shorter = growth_time(make, fit, every, spec.dt)
-    grows = shorter < (longest or 0.0)
-    if longest_run is None and grows and errors["phy"].error > _error_of(baselines["constant"]):
-        # free runs over whole recordings do not compare models of an unstable machine
-        longest_run = max(shorter, 2 * spec.dt)
-        errors, baselines = judge.errors(unseen, longest_run, linear)
-        growth = (
-            f"small errors grow tenfold in {shorter:.2g} s, so long free runs do not compare models. Models are "
-            "trained and compared by free runs of that length; free_run of the DataSpec sets another length",
-        )
-        context.progress.warn(growth[0])
-    worse = warn_of_worse_outputs(errors["phy_nominal"].rmse, errors["phy"].rmse)
+    length_of_runs = run_length(
+        make, fit, every[: len(train)], every[len(train) :], dt=spec.dt, warm=context.warm, longest=longest,
+        free_run=spec.free_run,
+    )  # fmt: skip
+    longest_run, growth = length_of_runs.seconds, length_of_runs.warnings
+    errors, baselines, runs = judge.errors(unseen, longest_run, linear)
+    for warning in growth:
+        context.progress.warn(warning)
+    nominal, squares = (
+        [run.squared_errors(smoother.sizes.y) for run in runs[name]] for name in ("phy_nominal", "phy")
+    )
+    recordings = [run.name.partition("#")[0] for run in runs["phy"]]
+    worse = (
+        *warn_of_worse_outputs(errors["phy_nominal"].rmse, errors["phy"].rmse),
+        *warn_of_worse_fit(nominal, squares, recordings, max(1, round(context.time_unit / spec.dt))),
+    )
     length = longest_run or longest or trial
     context.progress.update("free runs", 1, 1, "fitting each recording alone")
     known_late = spec.largest_delay > 0 or any("HM-IDENTIFY-080" in one for one in fit.warnings)
@@ -354,7 +356,7 @@ def examined_prior(context: Context) -> PriorResult:
     own = {name: one.error for name, one in errors.items()} | {"constant": _error_of(baselines["constant"])}
     training: dict[str, float] = {}
     if own["phy"] >= own["constant"]:
-        seen, mean = judge.errors(every[: len(train)], longest_run)
+        seen, mean, _ = judge.errors(every[: len(train)], longest_run)
         training = {"phy": seen["phy"].error, "constant": _error_of(mean["constant"])}
     # an unstable machine is recorded in closed loop: the controller's inputs depend on the outputs, so linear models
     # predict the outputs from the inputs and look better than they are
@@ -367,7 +369,7 @@ def examined_prior(context: Context) -> PriorResult:
     lacks = [bounds_doubt(bounds, len(fit.standard_errors))]
     # where small errors grow, errors of initial states grow too: then the windows of the fit, with free initial states,
     # test the equations
-    short = grows and longest_run is not None
+    short = length_of_runs.growth < (longest or 0.0) and longest_run is not None
     follows = short and min(row["validation_error"] for row in fit.stages) <= POOR
     if not follows:
         lacks += [
@@ -428,8 +430,8 @@ class _Judge:
         trajectories: Sequence[Trajectory],
         length: float | None,
         linear: Mapping[str, LinearModel | str] = MappingProxyType({}),
-    ) -> tuple[dict[str, OutputErrors], dict[str, BaselineScores]]:
-        """Errors of the nominal and the fitted prior, and of a constant and linear models, by name.
+    ) -> tuple[dict[str, OutputErrors], dict[str, BaselineScores], dict[str, list[FreeRun]]]:
+        """Errors of the two priors (nominal, fitted), errors of a constant and of linear models, and the priors' runs.
 
         Args:
             trajectories: Smoothed trajectories.
@@ -438,12 +440,13 @@ class _Judge:
         """
         context, fitted = self.context, self.fitted
         runs = evaluation_trajectories(trajectories, self.smoother, context.warm, length)
-        dt, own = context.spec.dt, {}
+        dt, own, drawn = context.spec.dt, {}, {}
         for name, step in (
             ("phy_nominal", PriorStep(context.scenario.prior(), dt)),
             ("phy", PriorStep(fitted, dt, self.fit.substeps)),
         ):
-            found = score(free_runs(step, fitted, runs, context.warm), fitted, self.smoother.sizes.y)
+            drawn[name] = free_runs(step, fitted, runs, context.warm)
+            found = score(drawn[name], fitted, self.smoother.sizes.y)
             own[name] = OutputErrors(found.error, found.rmse, found.fit_percent)
         warm = context.warm + 1  # the prior's initial state is estimated with this sample
         simpler = {
@@ -455,7 +458,7 @@ class _Judge:
             else:
                 scored = self._scored(model.free_runs(runs, warm), runs, warm)
                 simpler[name] = replace(scored, chosen=model.chosen.text)
-        return own, simpler
+        return own, simpler, drawn
 
     def _scored(self, y_hat: Sequence[Array], runs: Sequence[Trajectory], warm: int) -> BaselineScores:
         shown = [measured_as(self.fitted, own) for own in y_hat]

@@ -379,7 +379,9 @@ def _free_run_tables(context: Context) -> list[Table]:
         rows.append((name, finite(one.error), _percent(one.error, base), *rmse, *fit))
     columns = ("model", "error [spreads]", "over the prior's", *(f"RMSE of {label}" for label in outputs),
                *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
-    tables = [Table(columns, rows, "Free runs on test data: outputs.")]
+    length = context.prior.longest_run
+    of = "" if length is None else f" of {length:.3g} s"
+    tables = [Table(columns, rows, f"Free runs{of} on test data: outputs.")]
     balances = [f"{b.name} [{b.rate_unit}]" for b in prior.equations.balances]
     base = finite(found.scores["phy"].model.e_sim)
     rows = [
