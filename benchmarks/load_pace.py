@@ -28,7 +28,7 @@ from unknown_loops import interval, prepared
 
 from hybrid_mpc import Estimate, ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.control.sizes import disturbance_sizes
-from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter
+from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, with_outliers
 from hybrid_mpc.kit.assembly import FIRST_LOAD, first_deviations, make_controller
 from hybrid_mpc.loop.loop import Loop
 
@@ -47,7 +47,7 @@ def observer_of(own: Made, quiet: float, slip: float) -> Filter:
         )  # fmt: skip
 
     modes = filter_of(1.0, quiet), filter_of(SLIP, slip), filter_of(1.0, JUMP), filter_of(1.0, quiet, OUTLIER)
-    return SwitchingFilter(modes, SWITCHES)
+    return SwitchingFilter(modes, with_outliers(SWITCHES))
 
 
 class Spoiled:
@@ -81,8 +81,7 @@ def compared(
     observers: dict[str, Filter] = {"default": default}
     for one in steps:
         if one == "three":
-            usual = np.array(SWITCHES)[:3, :3]
-            observers[one] = SwitchingFilter(default.filters[:3], usual / usual.sum(axis=1, keepdims=True))
+            observers[one] = SwitchingFilter(default.filters[:3], SWITCHES)
         else:
             observers[one] = observer_of(own, *(float(v) for v in one.split("/")))
     base, rows = list[Ran](), []

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
-from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, SwitchingFilter
+from hybrid_mpc.estimate.switching import SLIP, SWITCHES, SwitchingFilter
 from hybrid_mpc.model.model import (
     HybridModel,
     ManyPoints,
@@ -121,8 +121,7 @@ def parameter_filter(
 ) -> SwitchingFilter:
     """The filter of a model with parameter states: quiet normally, quick after a fault.
 
-    It switches between four filters: quiet, slip (ten times the process noise), fault, in which parameters step, and
-    outlier (a thousand times the sensors' noise).
+    It switches between three filters: quiet, slip (ten times the process noise), and fault, in which parameters step.
     Keep ``sigma_d`` small: a load and heavier friction are indistinguishable until the motion reverses, and a change
     that a quick disturbance has explained is not attributed to a parameter.
 
@@ -149,21 +148,15 @@ def parameter_filter(
         )
     own = np.zeros(model.n_h - groups)
 
-    def filter_of(scale: float, size: float, sensor: float = 1.0) -> ExtendedKalmanFilter:
+    def filter_of(scale: float, size: float) -> ExtendedKalmanFilter:
         # a fitted model's parameters are known to a few per cent
         return ExtendedKalmanFilter(
-            model, sigma_y=sensor * np.asarray(sigma_y, dtype=float), sigma_x=scale * np.asarray(sigma_x, dtype=float),
-            sigma_x0=sigma_x0, sigma_d=sigma_d, sigma_d0=sigma_d0,
+            model, sigma_y=sigma_y, sigma_x=scale * np.asarray(sigma_x, dtype=float), sigma_x0=sigma_x0,
+            sigma_d=sigma_d, sigma_d0=sigma_d0,
             sigma_h=np.append(own, np.full(groups, size)), sigma_h0=np.append(own, np.full(groups, 0.02)),
         )  # fmt: skip
 
-    modes = (
-        filter_of(1.0, drift),
-        filter_of(SLIP, drift),
-        filter_of(1.0, step),
-        filter_of(1.0, drift, OUTLIER),
-    )
-    return SwitchingFilter(modes, SWITCHES)
+    return SwitchingFilter([filter_of(1.0, drift), filter_of(SLIP, drift), filter_of(1.0, step)], SWITCHES)
 
 
 def parameter_factors(theta: ArrayLike, most: float = 4.0) -> Array:

@@ -25,12 +25,26 @@ OUTLIER = 1000.0
 """Sensor noise, over the usual one, of an outlier. Samples count as outliers from 5.1 standard deviations on: there
 ``exp(-5.1^2 / 2) = 0.002 / 1000``. With 20 that would be 4.3, but a load would be found later, and gross outliers move
 the estimate."""
-SWITCHES = (
-    (0.9775, 0.02, 0.0005, 0.002), (0.5, 0.4975, 0.0005, 0.002), (0.45, 0.05, 0.498, 0.002), (0.9795, 0.02, 0.0005, 0.0)
-)  # fmt: skip
-"""Transition probabilities per period between four modes (quiet, slip, jump, outlier). At 50 Hz: a slip every second, a
-load change or a fault every 40 s, an outlier every 10 s; slips and jumps last one or two periods. No outlier follows
-another at once: a filter that may ignore several samples also ignores a kick to the machine."""
+SWITCHES = ((0.9795, 0.02, 0.0005), (0.5, 0.4995, 0.0005), (0.45, 0.05, 0.5))
+"""Transition probabilities per period between three modes (quiet, slip, jump). At 50 Hz: a slip every second, a load
+change or a fault every 40 s; each lasts one or two periods."""
+OUTLIERS = 0.002
+"""Probability of an outlier per period: at 50 Hz one every 10 s."""
+
+
+def with_outliers(transition: ArrayLike) -> Array:
+    """Transition probabilities ``(m + 1, m + 1)`` with a further mode, outlier, from those of ``m`` modes.
+
+    No outlier follows another at once: a filter that may ignore several samples also ignores a kick to the machine.
+
+    Example:
+        >>> with_outliers([[1.0]]).tolist()
+        [[0.998, 0.002], [1.0, 0.0]]
+    """
+    usual = np.asarray(transition, dtype=float)
+    return np.block(
+        [[(1.0 - OUTLIERS) * usual, np.full((len(usual), 1), OUTLIERS)], [usual[:1], np.zeros((1, 1))]]
+    )
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
-from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, SwitchingFilter
+from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, SwitchingFilter, with_outliers
 from hybrid_mpc.estimate.tuning import FOUND, choose_most_likely, remaining_load
 from hybrid_mpc.loop.guard import Guard, Mode
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # what takes long to import is imported where it is made
 
 Array = NDArray[np.float64]
 MODES = ("quiet", "slip", "jump", "outlier")
-"""Modes of the observer, in the order of :data:`~hybrid_mpc.estimate.switching.SWITCHES`."""
+"""Modes of the observer: those of :data:`~hybrid_mpc.estimate.switching.SWITCHES`, and outlier."""
 QUIET_SHARE = 0.0003
 """Standard deviation of the load's random walk per period in the quiet filter, as a share of the load's size (drift,
 temperature). It is doubled if the filter is too slow, see :func:`quiet_shares`."""
@@ -274,7 +274,7 @@ def make_estimator(
         filter_of(1.0, quiet, sensor=OUTLIER),
     )  # fmt: skip
     _check_found(modes[:3], SEARCHED * control.horizon, Sizes(model, control).states)
-    return SwitchingFilter(modes, SWITCHES)
+    return SwitchingFilter(modes, with_outliers(SWITCHES))
 
 
 def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Array) -> None:
