@@ -57,6 +57,34 @@ def test_an_oven(call, tmp_path):
     assert len(left) >= 6
 
 
+def test_a_wrapped_direction_becomes_a_periodic_disturbance(call, tmp_path):
+    """A drift by a wind that turns through north: the first prior is linear in sine and cosine, with their gains."""
+    rng = np.random.default_rng(2)
+    u, angle = np.repeat(rng.choice([-1.0, 0.0, 1.0], 45), 20), np.cumsum(8.0 * rng.standard_normal(900))
+    speed = [0.0]
+    for push, wind in zip(u[:-1], np.radians(angle[:-1]), strict=True):
+        rest = push + 0.5 * np.sin(wind)
+        speed.append(rest + (speed[-1] - rest) * np.exp(-0.5 / 5.0))
+    noisy = np.array(speed) + 0.001 * rng.standard_normal(900)
+    columns = {
+        "time [s]": 0.5 * np.arange(900),
+        "push [V]": u,
+        "wind [deg]": angle % 360,
+        "speed [m/s]": noisy,
+    }
+    file, machine = write_csv(tmp_path / "monday.csv", columns), tmp_path / "boat.py"
+    words = ("--input-column", "push", "--output-column", "speed", "--disturbance-column", "wind")
+    code, _, error = call("new", machine, "--data", file, *words)
+    assert code == 0, error
+    prior = load_scenario(str(machine)).prior()
+    assert [(s.name, s.period) for s in prior.disturbances] == [("wind", 360.0)]
+    # means over a period against values held over it: some per cent of the gain
+    assert prior.values["k_speed_sin_wind"] == pytest.approx(0.5, rel=0.1)
+    assert prior.values["k_speed_cos_wind"] == pytest.approx(0.0, abs=0.05)
+    code, told, _ = call("check", machine, "--data", file)
+    assert code == 0, told
+
+
 def test_a_disturbance_that_is_measured(call, tmp_path):
     """An oven whose room is measured: what it does is learned beside the heater's gain."""
     rng = np.random.default_rng(1)
