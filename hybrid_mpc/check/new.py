@@ -360,6 +360,24 @@ def _left_to_user(
     return found
 
 
+def _depends(draft: Draft, goal: Column) -> bool:
+    """Whether a set-point explains half of what the outputs alone leave unexplained of an input, in most recordings.
+
+    So the input of a servo of small gain, whose output does not follow, shows that a loop acted.
+    """
+    explained = []
+    for run, wanted in zip(draft.runs, goal.pieces, strict=True):
+        if len(run.y) != len(wanted):
+            continue
+        known = np.isfinite(wanted) & np.isfinite(run.y).all(axis=1)
+        alone = np.column_stack([np.ones(known.sum()), run.y[known]])
+        both, u = np.column_stack([alone, wanted[known]]), run.u[known, : len(draft.inputs)]
+        left = [u - x @ np.linalg.lstsq(x, u, rcond=None)[0] for x in (alone, both)]
+        before, after = (np.sum(one**2, axis=0) for one in left)
+        explained.append(bool((after < 0.5 * before).any()))
+    return 2 * sum(explained) > len(explained)
+
+
 def _in_loop(draft: Draft) -> Draft:
     """The draft with signs of a closed loop, and of an unstable machine in it."""
     if any(not np.isfinite(c.values).all() for c in draft.inputs):
@@ -372,6 +390,8 @@ def _in_loop(draft: Draft) -> Draft:
         loop = f"inputs react to outputs, {answered:.1f} times more than by chance"
     elif any(draft.verdicts[c.full].sure for c in draft.set_points):  # unsure: no column follows it
         loop = "a column follows a set-point"
+    elif any(_depends(draft, c) for c in draft.set_points):
+        loop = "an input depends on a set-point and the outputs"
     growth = growth_of(runs, draft.period) if loop else 0.0
     return replace(draft, loop=loop, growth=growth)
 
