@@ -8,7 +8,7 @@ core; random weights but with ``--model``, which take the same time.
   ``/ mandatory`` is the ratio to the arithmetic that a step of ``rti`` cannot do without, at the speed of ``dgemm``
   measured here;
 - ``--growth``: exponents of the times in N (20 to 200) and in z (16 to 256);
-- ``--loop``: wall clock of the parts of a period [ms], with three filters and with one: estimator, ``rti`` behind its
+- ``--loop``: wall clock of the parts of a period [ms], with four filters and with one: estimator, ``rti`` behind its
   safeguards, monitor;
 - ``--cpu``: processor time of the solvers, which leaves out what other work on a busy machine takes.
 """
@@ -117,7 +117,7 @@ def loop_parts(folder: Path | None, seeds: int) -> list[dict]:
         kit = load(folder)
         models, noise = kit.models, kit.loop.process_noise
     model, sigma_x, rows = models["hybrid"], np.array(noise.get("hybrid_observer", SIGMA_X)), []
-    for kind, observer in (("three filters", True), ("one filter", False)):
+    for kind, observer in (("four filters", True), ("one filter", False)):
         loops = []
         for task in (t for t in scenario.tasks if t.name in TASKS):
             control = task.control or CONTROL

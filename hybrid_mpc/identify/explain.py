@@ -129,7 +129,7 @@ class _HeldOut:
     starts: tuple[tuple[Trajectory, int], ...]
     pieces: Places
     folds: Places
-    told: Evidence
+    summary: Evidence
     warm: int
 
     @property
@@ -172,7 +172,7 @@ class _HeldOut:
         for pieces in range(n + 1, 10 * n + 1):
             wide = float(student.ppf(1.0 - DOUBT / candidates, pieces - 1)) * scatter / math.sqrt(pieces)
             if mean + wide < 0:
-                return math.ceil((pieces - n) * self.told.recordings / n)
+                return math.ceil((pieces - n) * self.summary.recordings / n)
         return 0
 
     def _each(self, own: Array, other: Array) -> Array:
@@ -433,7 +433,7 @@ class _Search:
         fits = [problem.solve(one, ITERATIONS) for one in starts]
         return min(fits, key=lambda fit: problem.explained([fit.theta])[0])
 
-    def untold(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
+    def indistinct(self, terms: Terms, fitted: Fitted, new: Terms) -> list[Term]:
         """New terms whose weights are all insignificant.
 
         For a term with a state, weight and time constant are identified together, so only the held-out error decides.
@@ -614,7 +614,7 @@ def explain(
     begun: Explanation | None = None,
     most: int = STEPS,
     on_progress: Progress = lambda done, total, text: None,
-    on_step: Callable[[Explanation], None] = lambda told: None,
+    on_step: Callable[[Explanation], None] = lambda found: None,
 ) -> Explanation:
     """Search for the terms that a fitted prior lacks.
 
@@ -693,7 +693,7 @@ class _Explain:
         spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
         self.search = _Search(base, dt, self.evidence, short, sizes, points, spread)
         given = library(prior, points, dt, length) if candidates is None else candidates
-        if self.evidence.told.recordings == 1:
+        if self.evidence.summary.recordings == 1:
             given = [one for one in given if not _is_generic(one)]
         self.pool = [*given, *(Candidate(term.name, (term,)) for term in own)]
         _check(prior, self.pool, own, points)
@@ -718,7 +718,7 @@ class _Explain:
         while sum(step.action == "added" for step in self.steps) < most:
             trials, scored, chosen = self._step()
             if chosen is None:
-                last, reason = trials, _reason(trials, self.evidence.told.pieces)
+                last, reason = trials, _reason(trials, self.evidence.summary.pieces)
                 break
             self._add(chosen, scored, trials)
             self._remove()
@@ -810,15 +810,15 @@ class _Explain:
                     said = f"fitted to all data, the error with it is {left:.3f} times that without it"
                     yield _Fitted(forms, None, own.theta, np.zeros(0), said, worse=True)
                     continue
-                untold = search.untold(terms, own, forms)
+                indistinct = search.indistinct(terms, own, forms)
                 squares = search.held_out(terms, own.theta)
             except (InputError, np.linalg.LinAlgError) as error:
                 yield _Fitted(forms, None, np.zeros(0), np.zeros(0), str(error))
                 continue
-            yield self._judged(forms, own.theta, squares, len(some), untold)
+            yield self._judged(forms, own.theta, squares, len(some), indistinct)
 
     def _judged(
-        self, forms: Terms, theta: Array, squares: Array, candidates: int, untold: Sequence[Term]
+        self, forms: Terms, theta: Array, squares: Array, candidates: int, indistinct: Sequence[Term]
     ) -> _Fitted:
         found = self.evidence.compared(squares, self.now.squares, candidates)
         reason = ""
@@ -832,7 +832,7 @@ class _Explain:
             reason = f"the ratio to the model without it is {found.words}: not significant"
             if more:
                 reason += f"; record {more} more like these to show it"
-        elif self.evidence.told.recordings == 1 and found.ratio > GAIN:
+        elif self.evidence.summary.recordings == 1 and found.ratio > GAIN:
             reason = (
                 f"the ratio to the model without it is {found.words}, but with a single recording it must be below "
                 f"{GAIN:g}: record a second one"
@@ -842,8 +842,10 @@ class _Explain:
                 f"the ratio to the model without it is {found.words}: with an error of {found.error:.2f} spreads, a "
                 f"ratio above {GAIN:g} may be chance"
             )
-        elif untold:
-            reason = f"the data do not identify the parameters of {', '.join(term.name for term in untold)}"
+        elif indistinct:
+            reason = (
+                f"the data do not identify the parameters of {', '.join(term.name for term in indistinct)}"
+            )
         elif ends := self._at_bounds(forms, theta):
             reason = f"{', '.join(ends)} would end at a bound"
         return _Fitted(forms, found, theta, squares, reason, not reason)
@@ -971,7 +973,7 @@ class _Explain:
             steps=tuple(steps),
             last=last,
             parameters=parameters,
-            evidence=self.evidence.told,
+            evidence=self.evidence.summary,
             candidates=self.candidates,
             reason=reason,
         )

@@ -116,8 +116,8 @@ def run(
             ahead = [
                 s.name for s in STAGES[i:] if s.name not in (*skip, *without) and (not only or s.name in only)
             ]
-            told = stage.name not in without  # a stage that is not part of this run does not begin
-            if told:
+            announced = stage.name not in without  # a stage that is not part of this run does not begin
+            if announced:
                 context.progress.start(stage.title + remaining(took, ahead))
             begun = time.monotonic()
             if only and stage.name not in (*only, *ALWAYS):
@@ -126,9 +126,9 @@ def run(
                 said = bring_up_to_date(context, stage, stage.name in skip)
                 if not said and stage in (PRIOR, TRAINING, EVALUATION):
                     report_so_far(context)
-                if not said and told:
+                if not said and announced:
                     took[stage.name] = time.monotonic() - begun
-            if told:
+            if announced:
                 context.progress.finish(said)
     return read_results(out / "results.json")
 
