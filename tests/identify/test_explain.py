@@ -382,10 +382,10 @@ def test_products_need_several_recordings():
     ("recordings", "ratio", "added"), [(1, 0.8, 0), (1, 0.6, 1), (5, 0.8, 1), (5, 0.9, 0)]
 )
 def test_a_single_recording_must_show_more(recordings, ratio, added):
-    told = SimpleNamespace(recordings=recordings)
+    summary = SimpleNamespace(recordings=recordings)
     found = HeldOutError(error=0.1, ratio=ratio, lower=0.5, upper=0.95, harm=0.0)
     search = SimpleNamespace(
-        evidence=SimpleNamespace(told=told, compared=lambda *squares: found),
+        evidence=SimpleNamespace(summary=summary, compared=lambda *squares: found),
         now=SimpleNamespace(squares=np.ones((2, 3)), terms=()),
         _at_bounds=lambda forms, theta: [],
     )
