@@ -18,7 +18,7 @@ from hybrid_mpc import Scaling, load_scenario
 from hybrid_mpc.files import read_arrays, read_json
 from hybrid_mpc.identify.evaluate import stacked_free_runs
 from hybrid_mpc.identify.train import Trained
-from hybrid_mpc.workflow.context import Silent
+from hybrid_mpc.engine import Progress
 from scenarios.paper.jobs import Case, step_class
 from scenarios.paper.run import Work
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
@@ -79,7 +79,7 @@ def main() -> None:
     scenario = load_scenario(settings.scenario)
     experiment = experiment_of(scenario)
     work = Work(
-        settings, scenario, experiment, settings.effort(experiment), options.folder, Silent(), workers=0
+        settings, scenario, experiment, settings.effort(experiment), options.folder, Progress(), workers=0
     )
     for data_set in experiment.data_sets:
         case = work.case(data_set, options.sequences)

@@ -16,7 +16,7 @@ import numpy as np
 
 from hybrid_mpc import load_scenario
 from hybrid_mpc.files import read_json
-from hybrid_mpc.workflow.context import Silent
+from hybrid_mpc.engine import Progress
 from scenarios.paper.jobs import ensemble_job, fit_job
 from scenarios.paper.run import Work, record_stage
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
@@ -40,7 +40,7 @@ def main() -> None:
         "golf_robot", networks=options.networks, sequences=(COUNT,), seed=options.seed
     )
     effort = settings.effort(experiment)
-    work = Work(settings, scenario, experiment, effort, options.out, Silent(), workers=0)
+    work = Work(settings, scenario, experiment, effort, options.out, Progress(), workers=0)
     record_stage(work)
     key = case_key(DATA_SET, COUNT, "prior")
     if not work.done(key):
