@@ -464,9 +464,16 @@ class _Judge:
         """Columns that are held and jump, next to others that do not."""
         if all(t.is_held for t in [*self.open, *self.of("output")]):
             return
-        named = bool(self.of("input"))  # next to a command by name, a held column may be a load
+        commands = self.of("input")  # next to a command by name, a held column may be a load
+        named = bool(commands)
         for trait in self.open:
-            if trait.is_held and not trait.is_switch:
+            if not trait.is_held or trait.is_switch:
+                continue
+            alike = [t for t in commands if "" in (t.unit, trait.unit) or t.unit == trait.unit]
+            followed = [t.full for t in alike if self._answers_to(trait, t)]
+            if followed:
+                self._say(trait, "none", f"it follows {followed[0]!r}: the drive's response to it", False)
+            else:
                 self._say(trait, "input", "it is held and jumps", sure=not named)
         for trait in self.open:
             if trait.is_held:

@@ -419,3 +419,14 @@ def test_reasons_are_comments(tmp_path):
     assert calls <= {"Signal", "Parameter", "Scenario", "DataSpec"}
     assert sum(isinstance(node, ast.Import | ast.ImportFrom) for node in ast.walk(ast.parse(text))) == 1
     assert len(text.splitlines()) == text.count("\n")
+
+
+def test_a_coarse_measurement_of_a_command_is_no_second_input():
+    rng = np.random.default_rng(0)
+    command = np.repeat(rng.integers(10, 30, 60) * 50.0, 20)
+    lag = np.convolve(command, np.full(3, 1 / 3))[: len(command)]
+    measured = 100 * np.round(lag / 100)  # held between steps of the sensor
+    ship = np.convolve(command, 0.95 ** np.arange(200))[: len(command)] + rng.standard_normal(len(command))
+    columns = {"rpm_cmd": command, "speed": ship, "prop_rpm": measured}
+    found = judge_roles([Trait(name, "", (column,)) for name, column in columns.items()])
+    assert [verdict.kind for verdict in found.values()] == ["input", "output", "none"]

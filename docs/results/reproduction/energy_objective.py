@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import Scaling, load_scenario
+from hybrid_mpc.engine import Progress
 from hybrid_mpc.files import read_arrays, read_json
 from hybrid_mpc.identify.evaluate import stacked_free_runs
 from hybrid_mpc.identify.train import Trained
-from hybrid_mpc.engine import Progress
 from scenarios.paper.jobs import Case, step_class
 from scenarios.paper.run import Work
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_mpc import load_scenario
-from hybrid_mpc.files import read_json
 from hybrid_mpc.engine import Progress
+from hybrid_mpc.files import read_json
 from scenarios.paper.jobs import ensemble_job, fit_job
 from scenarios.paper.run import Work, record_stage
 from scenarios.paper.settings import ReproductionSettings, case_key, experiment_of
