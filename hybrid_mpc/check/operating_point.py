@@ -11,6 +11,7 @@ from hybrid_mpc.identify.smooth import output_slope
 from hybrid_mpc.machine.prior import OperatingPoint, Prior
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.model.equilibrium import Descent, RateEquations, rate_search
+from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -88,7 +89,8 @@ def both_ways(prior: Prior) -> str:
 def _why_not_held(prior: Prior) -> str:
     """Why no input holds the operating point's states, and an equilibrium with one of its outputs, if there is one."""
     text = "no input within its range" if _found(prior, _places_of_inputs(prior)).steady else (
-        "none, not even beyond its range, because an equation of your states has no input"
+        f"none, not even beyond its range: {counted(len(prior.inputs), 'input')} cannot make "
+        f"{counted(len(prior.states), 'rate')} zero at these states"
     )  # fmt: skip
     x, u, w = rest_of(prior)
     by_x = output_slope(prior.equations)(x, u, w, prior.p)[1].full()

@@ -57,6 +57,8 @@ QUIET = 3.0
 """Largest link that may be chance."""
 LEADS = 2.0
 """Least ratio of a link to the reverse one for the first column to be the cause."""
+STRONGER = 8.0
+"""Ratio of a column's strongest effect on others to that of an input on it, from which the latter may be chance."""
 MOST_LINKED = 16
 """Most columns among which links are computed."""
 GAIN, OFFSET = 0.25, 0.25
@@ -562,19 +564,24 @@ class _Judge:
                 self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
                 continue
             # a column that no input affects is no output of the machine; angles belong to the machine in any case
-            free = turn_in(trait.unit) is None and all(self.links.of(t, trait) < QUIET for t in inputs)
+            strongest = max((self.links.of(trait, t) for t in outputs), default=0.0)
+            free = turn_in(trait.unit) is None and all(
+                self.links.of(t, trait) < max(QUIET, strongest / STRONGER) for t in inputs
+            )
             free = free and not any(is_rate(trait, t) or is_rate(t, trait) for t in outputs)
             moved = [t for t in outputs if self.links.of(trait, t, beside=inputs) >= ACTS] if free else []
             back = max((self.links.of(t, trait) for t in moved), default=0.0)
             there = max((self.links.of(trait, t, beside=inputs) for t in moved), default=0.0)
             if moved and back < max(QUIET, there / LEADS):
-                if trait.unit in DRIVING_UNITS and trait.whole and trait.said == "":
-                    self._say(
-                        trait,
-                        "input",
-                        f"it affects outputs, and {trait.unit} is a typical unit of inputs",
-                        False,
+                known = trait.unit and trait.unit not in REACHED_UNITS
+                alike = next((t.full for t in inputs if known and t.unit == trait.unit), "")
+                if (trait.unit in DRIVING_UNITS or alike) and trait.whole and trait.said == "":
+                    unit = (
+                        f"it has the unit of {alike!r}"
+                        if alike
+                        else f"{trait.unit} is a typical unit of inputs"
                     )
+                    self._say(trait, "input", f"it affects outputs, and {unit}", False)
                 else:
                     self._say(trait, "disturbance", "no input affects it, and it affects outputs", False)
             elif (

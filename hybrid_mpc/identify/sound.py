@@ -143,6 +143,35 @@ def growth_time(
     return own.reach(own.scaled(fit.values), GROWN[0])
 
 
+def warn_of_stability(
+    make: Callable[..., Prior], fit: PriorFit, smoothed: Sequence[Trajectory], dt: float
+) -> tuple[str, ...]:
+    """A warning if the prior is unstable with nominal parameters and far less with fitted ones, or the reverse.
+
+    Recordings in closed loop hardly show whether the machine alone is stable.
+
+    Args:
+        make: Prior class or factory ``(values=None) -> Prior``.
+        fit: The fit.
+        smoothed: Trajectories with smoothed states.
+        dt: Model period [s].
+    """
+    longest = max(float(t.t[-1] - t.t[0]) for t in smoothed)
+    nominal, fitted = (
+        growth_time(make, one, smoothed, dt) for one in (replace(fit, values=make().values), fit)
+    )
+    # growth in five times the time counts as none
+    if max(nominal, fitted) < 5.0 * min(nominal, fitted) or min(nominal, fitted) > longest:
+        return ()
+    which, other = ("nominal", "fitted") if nominal < fitted else ("fitted", "nominal")
+    return (
+        f"with {which} parameters the prior is unstable (small errors grow tenfold in {min(nominal, fitted):.2g} s), "
+        f"with {other} ones they hardly grow. Recordings in closed loop do not tell which is right, and a controller for "
+        "the wrong one may fail: compare with what the machine does without control, and narrow the bounds of the "
+        "parameters that decide it (docs/unstable.md) [HM-IDENTIFY-085]",
+    )
+
+
 def trial_length(
     make: Callable[..., Prior],
     fit: PriorFit,

@@ -430,3 +430,16 @@ def test_a_coarse_measurement_of_a_command_is_no_second_input():
     columns = {"rpm_cmd": command, "speed": ship, "prop_rpm": measured}
     found = judge_roles([Trait(name, "", (column,)) for name, column in columns.items()])
     assert [verdict.kind for verdict in found.values()] == ["input", "output", "none"]
+
+
+def test_a_second_flow_that_nothing_affects_is_an_input_too():
+    rng = np.random.default_rng(1)
+    feed, coolant = (np.convolve(rng.standard_normal(1500), np.ones(9) / 9)[:1500] for _ in range(2))
+    coolant = coolant + 0.05 * np.roll(feed, 1)  # one controller moves both
+    jacket = np.convolve(coolant, 0.9 ** np.arange(80))[:1500]
+    reactor = np.convolve(jacket + 4 * feed, 0.95 ** np.arange(120))[:1500]
+    columns = {"feed_lpm": feed, "coolant_lpm": coolant, "reactor": reactor, "jacket": jacket}
+    noisy = {name: c + 0.02 * np.std(c) * rng.standard_normal(1500) for name, c in columns.items()}
+    units = {"feed_lpm": "l/min", "coolant_lpm": "l/min"}
+    found = judge_roles([Trait(name, units.get(name, ""), (c,)) for name, c in noisy.items()])
+    assert [verdict.kind for verdict in found.values()] == ["input", "input", "output", "output"]

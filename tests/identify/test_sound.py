@@ -8,13 +8,14 @@ import pytest
 from example_priors import Swing
 from simulated_pendulum import DT, Pendulum, record
 
-from hybrid_mpc import Parameter, Signal, fit_prior
+from hybrid_mpc import Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.sound import (
     bound_costs,
     constant_runs,
     problems,
     structure_doubt,
+    warn_of_stability,
     warn_of_worse_fit,
 )
 
@@ -133,3 +134,23 @@ def test_a_fit_that_is_surely_worse_than_nominal_values_is_named(factors, warned
     fitted = [factor * own for factor, own in zip(factors, nominal, strict=True)]
     found = warn_of_worse_fit(nominal, fitted, ["a", "b", "c", "d"])
     assert ["HM-IDENTIFY-084" in one for one in found] == [True] * warned
+
+
+class Undecided(Prior):
+    """Its sign decides whether it is stable."""
+
+    states = outputs = (Signal("x", "m", -9.0, 9.0),)
+    inputs = (Signal("u", "m/s", -9.0, 9.0),)
+    parameters = (Parameter("a", 2.0, "1/s", -4.0, 4.0),)
+
+    def xdot(self, x, u, w, p):
+        return (p.a * x.x + u.u,)
+
+
+@pytest.mark.parametrize(("value", "warned"), [(-1.0, True), (1.0, False), (2.0, False)])
+def test_a_fit_that_makes_an_unstable_prior_stable_is_named(sound, value, warned):
+    t = 0.1 * np.arange(100)
+    x = np.sin(t)[:, None]
+    known = Trajectory("run", "train", 0.1, t, 0.0 * x, x, x, 0.0 * x)
+    found = warn_of_stability(Undecided, replace(sound, values={"a": value}), [known], 0.1)
+    assert ["HM-IDENTIFY-085" in one for one in found] == [True] * warned

@@ -48,6 +48,7 @@ from hybrid_mpc.identify.sound import (
     problems,
     structure_doubt,
     trial_length,
+    warn_of_stability,
     warn_of_worse_fit,
     warn_of_worse_outputs,
 )
@@ -344,6 +345,7 @@ def examined_prior(context: Context) -> PriorResult:
     worse = (
         *warn_of_worse_outputs(errors["phy_nominal"].rmse, errors["phy"].rmse),
         *warn_of_worse_fit(nominal, squares, recordings, max(1, round(context.time_unit / spec.dt))),
+        *warn_of_stability(make, fit, every[: len(train)], spec.dt),
     )
     length = longest_run or longest or trial
     context.progress.update("free runs", 1, 1, "fitting each recording alone")
