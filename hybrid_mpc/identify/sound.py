@@ -166,8 +166,8 @@ def warn_of_stability(
     which, other = ("nominal", "fitted") if nominal < fitted else ("fitted", "nominal")
     return (
         f"with {which} parameters the prior is unstable (small errors grow tenfold in {min(nominal, fitted):.2g} s), "
-        f"with {other} ones they hardly grow. Recordings in closed loop do not tell which is right, and a controller for "
-        "the wrong one may fail: compare with what the machine does without control, and narrow the bounds of the "
+        f"with {other} ones they hardly grow. Recordings in closed loop do not tell which is right, and a controller "
+        "for the wrong one may fail: compare with what the machine does without control, and narrow the bounds of the "
         "parameters that decide it (docs/unstable.md) [HM-IDENTIFY-085]",
     )
 
