@@ -11,7 +11,7 @@ Source: Bock, *Recent advances in parameter identification techniques for O.D.E.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -201,25 +201,23 @@ class Shooting:
 
     def several(
         self,
+        fit: OutputFit,
         thetas: Array,
-        each: Callable[[Sequence[int]], OutputFit],
-        keep: Sequence[int],
+        steps: int,
         free: int | None = None,
     ) -> list[Trial]:
-        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs; the worst ones end early.
+        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs.
 
         Args:
+            fit: The fit of several ``thetas``, whose windows lie one behind the other.
             thetas: Starts.
-            each: Returns the fit for the starts of given numbers, whose windows lie one behind the other.
-            keep: Number of starts that continue, after each two steps.
+            steps: Pairs of Gauss-Newton steps; 0: only initial states are fitted.
             free: Number of fitted parameters, from the first one on. Default: all.
         """
-        alive, n = list(range(len(thetas))), len(self.windows.x)
-        damping = np.full(len(thetas), DAMPING)
+        m, n = len(thetas), len(self.windows.x)
+        damping = np.full(m, DAMPING)
         share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
-
-        def many(numbers: Sequence[int]) -> Shooting:
-            return Shooting(each(numbers), self.windows.times(len(numbers)), self.sizes, self.spread)
+        problem = Shooting(fit, self.windows.times(m), self.sizes, self.spread)
 
         def parts(point: _Point) -> list[_Point]:
             rows = [slice(i * n, (i + 1) * n) for i in range(len(point.theta))]
@@ -228,40 +226,26 @@ class Shooting:
                 for theta, r in zip(point.theta, rows, strict=True)
             ]
 
-        problem = many(alive)
         begun = problem._states(problem.start(thetas, problem.windows.x, "x"))
-        point = problem._at(begun, thetas, begun.x, "all") if keep else begun
-        found = dict(zip(alive, parts(point), strict=True))
-        for left in keep:
-            for _ in range(2):
-                steps = []
-                for k in alive:
-                    xx, xt, tt, gx, gt = self._normal(found[k])
-                    normal = xx, xt[..., :free], tt[:free, :free], gx, gt[:free]
-                    step, moved, _ = self._step(normal, damping[k], found[k].theta[:free])
-                    steps.append((np.pad(step, (0, thetas.shape[1] - len(step))), moved))
-                theta = np.stack([
-                    np.clip(found[k].theta + step, self.own.lower, self.own.upper)
-                    for k, (step, _) in zip(alive, steps, strict=True)
-                ])  # fmt: skip
-                x = np.concatenate([
-                    found[k].x + moved[self.windows.group] * self.sizes
-                    for k, (_, moved) in zip(alive, steps, strict=True)
-                ])  # fmt: skip
-                trials = parts(many(alive)._at(begun, theta, x, "all"))
-                for k, trial in zip(alive, trials, strict=True):
-                    better = self._cost(trial) < self._cost(found[k])
-                    found[k] = trial if better else found[k]
-                    damping[k] *= 0.2 if better else 5.0
-            alive = sorted(alive, key=lambda k: self._cost(found[k]))[:left]
-        over = {
-            k: np.clip(found[k].error / np.tile(self.spread, self.windows.y.shape[1]), -FAR, FAR)
-            for k in alive
-        }
-        return [
-            Trial(k, found[k].theta, math.sqrt(float(np.square(over[k] * self.count).sum()) / share))
-            for k in alive
-        ]
+        found = parts(problem._at(begun, thetas, begun.x, "all") if steps else begun)
+        for _ in range(2 * steps):
+            theta, x = [], []
+            for one, damped in zip(found, damping, strict=True):
+                xx, xt, tt, gx, gt = self._normal(one)
+                normal = xx, xt[..., :free], tt[:free, :free], gx, gt[:free]
+                step, moved, _ = self._step(normal, damped, one.theta[:free])
+                further = one.theta + np.pad(step, (0, thetas.shape[1] - len(step)))
+                theta.append(np.clip(further, self.own.lower, self.own.upper))
+                x.append(one.x + moved[self.windows.group] * self.sizes)
+            for k, trial in enumerate(parts(problem._at(begun, np.stack(theta), np.concatenate(x), "all"))):
+                better = self._cost(trial) < self._cost(found[k])
+                found[k] = trial if better else found[k]
+                damping[k] *= 0.2 if better else 5.0
+        over = (
+            np.clip(one.error / np.tile(self.spread, self.windows.y.shape[1]), -FAR, FAR) for one in found
+        )
+        errors = (math.sqrt(float(np.square(own * self.count).sum()) / share) for own in over)
+        return [Trial(k, one.theta, e) for k, (one, e) in enumerate(zip(found, errors, strict=True))]
 
     def settled(self, theta: Array) -> Fitted:
         """Continue the fit to full convergence, so that the result depends neither on the start nor on rounding."""
@@ -394,10 +378,8 @@ class Shooting:
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
         whole = np.array([float(np.sqrt(np.mean(trim_outliers(v) ** 2))) if len(v) else 0.0 for v in left])
-        robust = np.maximum(
-            robust, COMMON * whole
-        )  # frequent errors are due to the prior; they are not outliers
-        return np.maximum(robust, 1e-9 * self.spread)
+        # frequent errors are due to the prior; they are not outliers
+        return np.maximum(np.maximum(robust, COMMON * whole), 1e-9 * self.spread)
 
     def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
         """Initial states for a given ``theta``: Levenberg-Marquardt steps in each group of windows."""
@@ -444,10 +426,8 @@ class Shooting:
                     x = self._states(self._at(point, theta, x, "x")).x
                 trial = self._at(point, theta, x, "all")
                 new = self._cost(trial)
-                if not (
-                    new < cost or last or followed or self.windows.warm
-                ):  # initial states may not fit the new theta yet
-                    followed = True
+                if not (new < cost or last or followed or self.windows.warm):
+                    followed = True  # initial states may not fit the new theta yet
                     own = self._followed(point, trial)
                     if self._cost(own) < cost:
                         trial = self._at(point, theta, own.x, "all")
@@ -540,7 +520,7 @@ class Shooting:
         if not self.windows.warm:
             reduced = tt - (xt.swapaxes(1, 2) @ by_theta).sum(axis=0)
             slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
-        step = _bounded(
+        step = bounded_step(
             reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30)), slope,
             self.own.lower[: len(theta)] - theta, self.own.upper[: len(theta)] - theta,
         )  # fmt: skip
@@ -556,7 +536,7 @@ class Shooting:
         return covariance(self.own, point.theta, slopes, error, falling, counted, taken, len(self.spread))
 
 
-def _bounded(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
+def bounded_step(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
     """Step ``s`` ``(n,)`` that reduces ``s' matrix s / 2 + slope' s`` within ``low <= 0`` and ``high >= 0``.
 
     Of the components that would leave their bounds, the first one to reach its bound is fixed there, and the others are

@@ -14,7 +14,7 @@ from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Prior, Signal
 from hybrid_mpc.data.differentiate import local_polynomial
 from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.identify.simulation import Simulation
-from hybrid_mpc.identify.smooth import IGNORANCE, Smoother, _whitened, sizes_of, unseen_states
+from hybrid_mpc.identify.smooth import IGNORANCE, Smoother, _innovations, _whitened, sizes_of, unseen_states
 from tests.simulated_pendulum import DT, TRUTH, Pendulum, record
 
 SIGMA = 1e-3
@@ -235,7 +235,7 @@ def test_the_likelihood_is_that_of_the_joint_gaussian():
     begin = within[:skip, :skip]
     squares = error @ np.linalg.solve(within, error) - error[:skip] @ np.linalg.solve(begin, error[:skip])
     logs = np.linalg.slogdet(within)[1] - np.linalg.slogdet(begin)[1]
-    found = smoother.innovations([run])
+    (found,) = _innovations([smoother], [run])
     assert found[2] == seen.sum() - skip
     # rounding of a matrix whose condition is the square of 3e3
     assert found[0] == pytest.approx(squares, rel=1e-6)
