@@ -372,10 +372,7 @@ def test_what_cannot_be_is_refused_by_name(why):
 
 @pytest.mark.parametrize(
     ("names", "words"),
-    [
-        (("depth",), r"Wrong.*depth.*level.*HM-MACHINE-012"),
-        ("level", r"'level'.*HM-MACHINE-011"),
-    ],
+    [(("depth",), r"Wrong.*depth.*level.*HM-MACHINE-012"), ("level", r"'level'.*HM-MACHINE-011")],
 )
 def test_what_is_corrected_must_be_a_state(names, words):
     with pytest.raises(InputError, match=words):
