@@ -17,12 +17,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit, delayed
 from hybrid_mpc.identify.shooting import OUTLIERS, Shooting
-from hybrid_mpc.identify.simulation import (
-    Simulation,
-    flow_slope,
-    rest_of,
-    with_unknown_rates,
-)
+from hybrid_mpc.identify.simulation import Simulation, flow_slope, rest_of, with_unknown_rates
 from hybrid_mpc.identify.smooth import Smoother, output_slope
 from hybrid_mpc.identify.windows import OutputWindows
 from hybrid_mpc.machine.prior import Equations

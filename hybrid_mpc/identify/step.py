@@ -123,10 +123,11 @@ class PriorStep(Step):
     def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """States of free runs, all runs in one call of CasADi; not differentiable."""
         runs, periods = x.shape[:-1].numel(), len(u)
+        # the last input is repeated
         u_all, w_all = (
             torch.cat([z, z[-1:]]).reshape(periods + 1, runs, z.shape[-1]).swapaxes(0, 1).numpy()
             for z in (u, w)
-        )  # the last input is repeated
+        )
         simulation = Simulation(self.prior.equations.xdot, self.dt)
         states = simulation.values(x.reshape(runs, -1).numpy(), u_all, w_all, self.p.numpy(), self.substeps)
         return torch.tensor(states).swapaxes(0, 1).reshape(periods + 1, *x.shape)
@@ -535,13 +536,6 @@ class TrainedParameters(nn.Module):
         """Difference from the prior's parameters, ``(networks, 1, n_p)``."""
         ways = torch.cat([self.ways[name] for name in self._spec], dim=1)
         return (ways @ self.spans).unsqueeze(1)
-
-    def values(self) -> dict[str, Tensor]:
-        """Values [their units] of each free parameter, ``(networks,)``."""
-        return {
-            name: start + (upper - lower) * self.ways[name][:, 0]
-            for name, (start, lower, upper) in self._spec.items()
-        }
 
     def project(self) -> None:
         """Clip the values to their bounds."""

@@ -185,11 +185,7 @@ def test_balances_stands_for_all_of_the_prior():
 @pytest.mark.parametrize(
     ("prior", "names", "words"),
     [
-        (
-            Tanks,
-            ("error", "energy"),
-            r"energy.*Tanks.*volume.*HM-IDENTIFY-040",
-        ),
+        (Tanks, ("error", "energy"), r"energy.*Tanks.*volume.*HM-IDENTIFY-040"),
         (Observed, ("balances",), r"Observed.*HM-IDENTIFY-040"),
         (Observed, ("position", "power"), r"position, power.*HM-IDENTIFY-040"),
     ],

@@ -14,10 +14,7 @@ SHORT = TrainingSettings("mopgrnn", 4, 2, 15, 10, seed=3, warm=10, horizon=20, b
 PRIOR = Pendulum(TRUTH)
 
 
-OPTIONS = (
-    {"objectives": ("error",)},
-    {"prior_parameters": "trained"},
-)
+OPTIONS = ({"objectives": ("error",)}, {"prior_parameters": "trained"})
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +63,7 @@ def test_teacher_forcing_takes_the_rates_where_free_runs_take_the_outputs(data):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"kind": "gru"}, "mopgrnn"),
-        ({"objectives": ()}, "HM-IDENTIFY-046"),
-    ],
+    ("wrong", "words"), [({"kind": "gru"}, "mopgrnn"), ({"objectives": ()}, "HM-IDENTIFY-046")]
 )
 def test_settings_that_are_none_are_refused_with_what_there_is(wrong, words):
     with pytest.raises(InputError, match=words):
