@@ -185,32 +185,34 @@ def own(law, unit="N m", upper=1.0, name="own", **more):
     return Term(name, "force", "phi_dot", (Parameter("k_own", 0.0, unit, 0.0, upper),), law, **more)
 
 
-def begun(*terms, runs=None, candidates=(), **more):
-    runs = recorded(Pendulum(), 4, 3.0) if runs is None else runs
+def begun(*terms, runs, candidates=(), **more):
     known = smoothed(Pendulum, fit_prior(Pendulum, runs, [], dt=DT, length=1.0), runs, DT)
     return explain(
         Pendulum, Pendulum().values, known, dt=DT, length=1.0, candidates=candidates, own=terms, **more
     )
 
 
-def test_own_terms_that_do_not_fit_are_refused():
-    refused = {
-        "units": (own(lambda at, p: -p.k_own * at.own),),
-        "one name": (own(lambda at, p: -p.k_own), own(lambda at, p: -p.k_own)),
-        "a loss that supplies": (own(lambda at, p: p.k_own * ca.tanh(at.own), loss=True),),
-        "a potential of the speed": (
-            Term("own", "potential", "phi_dot", (Parameter("k_own", 0.0, "N m", 0.0, 1.0),),
-                 lambda at, p: p.k_own * ca.tanh(at.own / 0.3)),
+@pytest.mark.parametrize(
+    ("given", "seconds", "code"),
+    [
+        ([own(lambda at, p: -p.k_own * at.own)], 3.0, "MACHINE-042"),  # units
+        (2 * [own(lambda at, p: -p.k_own)], 3.0, "IDENTIFY-013"),  # one name
+        (
+            [own(lambda at, p: p.k_own * ca.tanh(at.own), loss=True)],
+            3.0,
+            "IDENTIFY-074",
+        ),  # a loss that supplies
+        (
+            [replace(own(lambda at, p: p.k_own * ca.tanh(at.own / 0.3)), place="potential")],
+            3.0,
+            "MACHINE-043",
         ),
-    }  # fmt: skip
-    for terms_of_one in refused.values():
-        with pytest.raises(InputError):
-            begun(*terms_of_one)
-
-
-def test_too_little_evidence_is_refused():
-    with pytest.raises(InputError):
-        begun(runs=recorded(Pendulum(), 1, 0.5))
+        ([], 0.5, "IDENTIFY-012"),  # too little evidence
+    ],
+)
+def test_what_cannot_be_searched_is_refused(given, seconds, code):
+    with pytest.raises(InputError, match=code):
+        begun(*given, runs=recorded(Pendulum(), 4 if given else 1, seconds))
 
 
 def test_a_candidate_whose_fit_diverges_is_reported_and_the_search_goes_on():

@@ -7,7 +7,7 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, killed_and_resumed, same_training
 
-from hybrid_mpc import InputError, TrainingSettings, train
+from hybrid_mpc import TrainingSettings, train
 from hybrid_mpc.identify.objectives import OBJECTIVES
 
 SHORT = TrainingSettings("mopgrnn", 4, 2, 15, 10, seed=3, warm=10, horizon=20, batch=8, every=5)
@@ -60,16 +60,3 @@ def test_teacher_forcing_takes_the_rates_where_free_runs_take_the_outputs(data):
     )
     np.testing.assert_array_equal(rates.curve["loss_error"], outputs.curve["loss_output"])
     assert not np.array_equal(rates.curve["validation"], outputs.curve["validation"])  # each by its own
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"), [({"kind": "gru"}, "mopgrnn"), ({"objectives": ()}, "HM-IDENTIFY-046")]
-)
-def test_settings_that_are_none_are_refused_with_what_there_is(wrong, words):
-    with pytest.raises(InputError, match=words):
-        replace(SHORT, **wrong)
-
-
-def test_objectives_that_the_prior_lacks_are_refused_before_the_training(data):
-    with pytest.raises(InputError, match=r"power.*Pendulum.*energy.*HM-IDENTIFY-040"):
-        train(PRIOR, *data, replace(SHORT, objectives=("error", "power")), on_progress=None)
