@@ -504,9 +504,10 @@ def _squares(problem: Shooting, theta: Array) -> Array:
     """
     point = problem.start(theta, problem.first_states(theta), "")
     shape = problem.windows.y.shape
-    over = np.clip(point.error / np.tile(problem.spread, shape[1]), -REACH, REACH) * problem.count
     seen = problem.seen.sum(axis=-1)
-    return np.asarray(np.square(over).reshape(shape).sum(axis=-1) / np.maximum(seen, 1.0))
+    return np.asarray(
+        np.square(problem.relative(point, REACH)).reshape(shape).sum(axis=-1) / np.maximum(seen, 1.0)
+    )
 
 
 @dataclass(frozen=True)

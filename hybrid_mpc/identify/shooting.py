@@ -104,6 +104,12 @@ class _Point:
         """Scale of each error of a window."""
         return np.tile(self.scale, self.error.shape[1] // len(self.scale))
 
+    @property
+    def robust(self) -> Array:
+        """Robust cost of each error."""
+        c2, over = OUTLIERS**2, np.minimum(np.abs(self.error / self.scales), self.far)
+        return np.asarray(2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1))
+
     def where(self, better: NDArray[np.bool_], other: _Point) -> _Point:
         """Replace windows by those of ``other`` where ``better``."""
         own, new = ((p.x, p.error, p.slopes) for p in (self, other))
@@ -155,15 +161,17 @@ class Shooting:
                 begun = Shooting(self.own, problem.windows.beginning(periods), self.sizes, self.spread)
                 x = begun._states(begun.start(np.stack(some), x, "x")).x
             point = problem._states(problem.start(np.stack(some), x, "x"))
-            over = (
-                np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
-                * self.count
-            )
+            over = self.relative(point, FAR)
             for i, theta in enumerate(some):
                 part = slice(i * n, (i + 1) * n)
                 error = float(np.sqrt(np.square(over[part]).sum() / share))
                 self._known[theta.tobytes()] = error, point.x[part]
         return [self._known[theta.tobytes()][0] for theta in thetas]
+
+    def relative(self, point: _Point, far: float) -> Array:
+        """Counted errors ``(n, (T + 1) n_y)`` in spreads of the outputs, each at most ``far``."""
+        spreads = np.tile(self.spread, self.windows.y.shape[1])
+        return np.asarray(np.clip(point.error / spreads, -far, far) * self.count)
 
     def _growing(self, thetas: Sequence[Array]) -> list[int]:
         """Increasing lengths [periods] over which initial states are estimated before the whole windows.
@@ -190,7 +198,7 @@ class Shooting:
             point = self._descend(point, min(iterations, FIRST))
             # maximum number of times that the scales are estimated again; outliers hide small residuals at first
             for k in range(4):
-                rescaled = replace(point, scale=self._left(point.error), held=1.0)
+                rescaled = self._rescaled(point)
                 # ratio of new to old scales below which they are estimated again
                 if k and (rescaled.scale > 0.8 * point.scale).all():
                     break
@@ -241,18 +249,14 @@ class Shooting:
                 better = self._cost(trial) < self._cost(found[k])
                 found[k] = trial if better else found[k]
                 damping[k] *= 0.2 if better else 5.0
-        over = (
-            np.clip(one.error / np.tile(self.spread, self.windows.y.shape[1]), -FAR, FAR) for one in found
-        )
-        errors = (math.sqrt(float(np.square(own * self.count).sum()) / share) for own in over)
+        errors = (math.sqrt(float(np.square(self.relative(one, FAR)).sum()) / share) for one in found)
         return [Trial(k, one.theta, e) for k, (one, e) in enumerate(zip(found, errors, strict=True))]
 
     def settled(self, theta: Array) -> Fitted:
         """Continue the fit to full convergence, so that the result depends neither on the start nor on rounding."""
         point = self.start(theta, self.first_states(theta), "all")
         for _ in range(2):
-            rescaled = replace(point, scale=self._left(point.error), held=1.0)
-            point = self._descend(rescaled, ITERATIONS, CLOSELY)
+            point = self._descend(self._rescaled(point), ITERATIONS, CLOSELY)
         if (np.abs(point.error) > GROSS * point.scales).any():
             point = replace(point, far=GROSS)
         for _ in range(SETTLING):
@@ -288,8 +292,7 @@ class Shooting:
 
     def shift(self, theta: Array, substeps: int) -> Array:
         """Change of ``theta`` by a Gauss-Newton step if the outputs are computed with other ``substeps``."""
-        point = self.start(theta, self.first_states(theta), "all")
-        point = replace(point, scale=self._left(point.error), held=1.0)
+        point = self._rescaled(self.start(theta, self.first_states(theta), "all"))
         finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
         moved = [
             self._step(self._behind(p) if self.windows.warm else self._normal(p), 0.0, theta)[0]
@@ -309,16 +312,14 @@ class Shooting:
 
         Both are over the errors' scales and times the root of the robust weights.
         """
-        point = self.start(theta, x, "all")
-        return self._eliminated(replace(point, scale=self._left(point.error), held=1.0))[:2]
+        return self._eliminated(self._rescaled(self.start(theta, x, "all")))[:2]
 
     def scaled_slopes(self, theta: Array) -> tuple[Array, Array, Array]:
         """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` from the best first states, these
         eliminated, by the root of their robust weights [output units]; and the scale of each output's errors
         ``(n_y,)``.
         """
-        point = self.start(theta, self.first_states(theta), "all")
-        point = replace(point, scale=self._left(point.error), held=1.0)
+        point = self._rescaled(self.start(theta, self.first_states(theta), "all"))
         slopes, error, *_ = self._eliminated(point)
         unit = point.scales
         return slopes * unit[:, None], error * unit, point.scale
@@ -340,25 +341,20 @@ class Shooting:
             by = by.reshape(n, error.shape[1], by.shape[-1])
         return replace(before, theta=theta, x=x, error=error, slopes=by)
 
+    def _rescaled(self, point: _Point) -> _Point:
+        """The point with the residuals' robust scales, and with the full weight of the initial states' guesses."""
+        return replace(point, scale=self._left(point.error), held=1.0)
+
     def _costs(self, point: _Point) -> Array:
         """Robust cost of each group of windows for its initial state, with the distance from the guess."""
-        c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
-        over = np.minimum(np.abs(point.error / point.scales), point.far)
-        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
-        return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
+        moved = self._moved(point) / np.sqrt(self.members)[:, None]
+        return self._grouped((point.robust * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
 
     def _cost(self, point: _Point) -> float:
-        """Cost of ``theta``: sum over all windows; with a warm-up, over the samples after it."""
-        if not self.windows.warm:
-            return float(self._costs(point).sum()) + self._pulled(point)
-        c2 = OUTLIERS**2
-        over = np.minimum(np.abs(point.error / point.scales), point.far)
-        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
-        return float((own * self.count).sum()) + self._pulled(point)
-
-    def _pulled(self, point: _Point) -> float:
-        """Cost of the parameters' distance from their nominal values."""
-        return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
+        """Cost of ``theta``: sum over all windows; with a warm-up, over the samples after it; and the pull's cost."""
+        pulled = float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
+        own = point.robust * self.count if self.windows.warm else self._costs(point)
+        return float(own.sum()) + pulled
 
     def _moved(self, point: _Point) -> Array:
         """Distance of the initial states from their guess, in sizes, times the root of its weight."""

@@ -197,6 +197,8 @@ class RecurrentStep(Step):
     scale_centre_w: Tensor
     scale_xdot: Tensor
     own_shift: Tensor
+    into: Tensor
+    own_rows: Tensor
 
     def __init__(
         self,
@@ -216,9 +218,15 @@ class RecurrentStep(Step):
         own = shift if isinstance(shift, Tensor) else torch.zeros(len(prior.parameters), dtype=torch.float64)
         self.register_buffer("own_shift", own, persistent=False)
         for name, values in vars(scaling).items():
-            if name == "substeps":
-                continue
-            self.register_buffer(f"scale_{name}", torch.tensor(values, dtype=torch.float64))
+            if name != "substeps":
+                self.register_buffer(f"scale_{name}", torch.tensor(values, dtype=torch.float64))
+        rows = torch.tensor(prior.corrected, dtype=torch.int64)
+        into = torch.zeros(len(prior.states), len(rows), dtype=torch.float64)
+        into[rows, torch.arange(len(rows))] = 1.0
+        self.register_buffer("into", into, persistent=False)  # matrix from corrections to rates
+        self.register_buffer("own_rows", 1.0 - into.sum(1), persistent=False)
+        at = rows.tolist()
+        self.corrected = slice(at[0], at[-1] + 1) if at == list(range(at[0], at[-1] + 1)) else rows
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
@@ -328,27 +336,6 @@ class HybridStep(RecurrentStep):
     """
 
     corrects_prior = True
-    into: Tensor
-    own_rows: Tensor
-
-    def __init__(
-        self,
-        prior: Prior,
-        network: nn.Module,
-        scaling: Scaling,
-        dt: float,
-        *,
-        use_prior: bool = True,
-        shift: Tensor | TrainedParameters | None = None,
-    ) -> None:
-        super().__init__(prior, network, scaling, dt, use_prior=use_prior, shift=shift)
-        rows = torch.tensor(prior.corrected, dtype=torch.int64)
-        into = torch.zeros(len(prior.states), len(rows), dtype=torch.float64)
-        into[rows, torch.arange(len(rows))] = 1.0
-        self.register_buffer("into", into, persistent=False)  # matrix from corrections to rates
-        self.register_buffer("own_rows", 1.0 - into.sum(1), persistent=False)
-        at = rows.tolist()
-        self.corrected = slice(at[0], at[-1] + 1) if at == list(range(at[0], at[-1] + 1)) else rows
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
