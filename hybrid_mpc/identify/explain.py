@@ -45,7 +45,7 @@ from hybrid_mpc.identify.windows import OutputWindows, cut_outputs
 from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import POINT, Prior, named
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.machine.terms import At, Term, extended
+from hybrid_mpc.machine.terms import At, Term, extended, signals_at
 from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
@@ -491,10 +491,7 @@ def _vanishes(term: Term) -> bool:
 
 def _index(base: type[Prior], term: Term) -> int:
     """Index of a term's signal among the signals of its kind."""
-    groups: dict[str, tuple[Signal, ...]] = {
-        "input": base.inputs, "disturbance": base.disturbances, "output": base.outputs,
-    }  # fmt: skip
-    return [s.name for s in groups.get(term.place, base.states)].index(term.of)
+    return [s.name for s in signals_at(base, term.place)].index(term.of)
 
 
 def _squares(problem: Shooting, theta: Array) -> Array:
@@ -1036,12 +1033,9 @@ class _Pictures:
         return values, signal.label
 
     def _ordinate(self, term: Term) -> str:
+        unit = signals_at(self.base, term.place)[_index(self.base, term)].unit
         if term.place in ("input", "disturbance", "output"):
-            groups = {
-                "input": self.base.inputs, "disturbance": self.base.disturbances, "output": self.base.outputs,
-            }  # fmt: skip
-            return f"{term.name} [{groups[term.place][_index(self.base, term)].unit}]"
-        unit = self.base.states[_index(self.base, term)].unit
+            return f"{term.name} [{unit}]"
         if term.place == "rate":
             return f"{term.name} [{unit}/s]"
         return f"{term.name} [{'N' if unit.startswith('m') else 'N m'}]"

@@ -207,13 +207,7 @@ class Shooting:
                 point = self._descend(replace(point, far=GROSS), iterations)
         return Fitted(point.theta, *self._covariance(point))
 
-    def several(
-        self,
-        fit: OutputFit,
-        thetas: Array,
-        steps: int,
-        free: int | None = None,
-    ) -> list[Trial]:
+    def several(self, fit: OutputFit, thetas: Array, steps: int, free: int | None = None) -> list[Trial]:
         """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs.
 
         Args:

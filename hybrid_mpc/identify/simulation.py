@@ -305,8 +305,8 @@ def rest_of(prior: Prior) -> tuple[Array, Array, Array]:
 
 def measured_as(prior: Prior, y: Array) -> Array:
     """Clip outputs ``(..., n_y)`` to the sensors' declared ranges."""
-    ends = [s.saturation or (-math.inf, math.inf) for s in prior.outputs]
-    return np.asarray(np.clip(y, *zip(*ends, strict=True)))
+    low, high = np.array([s.saturation or (-math.inf, math.inf) for s in prior.outputs]).T
+    return np.asarray(np.clip(y, low, high))
 
 
 def _middle(signal: Signal) -> float:

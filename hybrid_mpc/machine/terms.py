@@ -103,11 +103,11 @@ class At(NamedTuple):
     @classmethod
     def of(cls, prior: Prior, point: Sequence[Any], own: Any, **more: Any) -> At:
         """Arguments of a law at the columns ``x, u, w, p`` of a prior."""
-        named_at = (
+        x, u, w, p = (
             named(prior.names_of(key), ca.vertsplit(v) if v.numel() else [])
             for key, v in zip(POINT, point, strict=True)
         )
-        return cls(*named_at, own, **more)
+        return cls(x, u, w, p, own, **more)
 
 
 @dataclass(frozen=True)
@@ -415,13 +415,18 @@ def _operating_point(base: type[Prior], terms: tuple[Term, ...]) -> OperatingPoi
     return OperatingPoint((*point.x, *more), point.u, point.w)
 
 
+def signals_at(base: type[Prior], place: str) -> tuple[Signal, ...]:
+    """The signals among which a term of a place has its own."""
+    found = {"input": base.inputs, "disturbance": base.disturbances, "output": base.outputs}
+    return found.get(place, base.states)
+
+
 def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
     problems, prior = [], base()
-    signals = {"input": base.inputs, "disturbance": base.disturbances, "output": base.outputs}
     moving = {base.states[v].name for _, v in prior.kinematics}
     for term in terms:
         where = f"term {term.name!r} for {base.__name__}"
-        names = [s.name for s in signals.get(term.place, base.states)]
+        names = [s.name for s in signals_at(base, term.place)]
         if term.of not in names:
             problems.append(
                 f"{where}: there is no {term.of!r}; choose of {', '.join(names)}. [HM-MACHINE-034]"
@@ -461,7 +466,7 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
         (v, s.unit) for key in groups for v, s in zip(symbols[key], groups[key], strict=True)
     ]
     kind: str = {"input": "u", "disturbance": "w"}.get(term.place, "x")
-    signals = base.outputs if term.place == "output" else groups[kind]
+    signals = signals_at(base, term.place)
     k = [s.name for s in signals].index(term.of)
     unit, position = signals[k].unit, None
     wanted, power = term_units.of(unit), None
@@ -547,18 +552,8 @@ def _added(
     if state is not None:
         options["state"] = state
     made = Made(maker, of, parameters, {**options, **({"place": place} if by_rate else {})})
-    return Term(
-        name=f"{title} of {of}",
-        place=place,
-        of=of,
-        parameters=parameters,
-        law=law,
-        text=text,
-        loss=loss,
-        state=state,
-        explanation=EXPLANATIONS[maker],
-        made=made,
-    )
+    name = f"{title} of {of}"
+    return Term(name, place, of, parameters, law, text, loss, state, EXPLANATIONS[maker], made)
 
 
 # Friction: against the motion of one axis.
@@ -576,16 +571,9 @@ def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") 
         place: ``"rate"`` for a prior that is not mechanical.
     """
     return _added(
-        "coulomb",
-        "Coulomb friction",
-        place,
-        of,
-        (level,),
-        lambda at, p: -p[0] * _sign(at.own, width),
-        f"-{level.name} sign({of})",
-        loss=True,
-        width=width,
-    )
+        "coulomb", "Coulomb friction", place, of, (level,), lambda at, p: -p[0] * _sign(at.own, width),
+        f"-{level.name} sign({of})", loss=True, width=width,
+    )  # fmt: skip
 
 
 def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force") -> Term:
@@ -606,15 +594,9 @@ def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force"
 def viscous(of: str, d: Parameter, *, place: Place = "force") -> Term:
     """Viscous friction ``-d v``."""
     return _added(
-        "viscous",
-        "viscous friction",
-        place,
-        of,
-        (d,),
-        lambda at, p: -p[0] * at.own,
-        f"-{d.name} {of}",
+        "viscous", "viscous friction", place, of, (d,), lambda at, p: -p[0] * at.own, f"-{d.name} {of}",
         loss=True,
-    )
+    )  # fmt: skip
 
 
 def viscous_by_direction(of: str, a: Parameter, *, place: Place = "force") -> Term:
@@ -866,14 +848,9 @@ def input_gain(of: str, g: Parameter) -> Term:
 def input_offset(of: str, value: Parameter) -> Term:
     """``u + offset``."""
     return _added(
-        "input_offset",
-        "input offset",
-        "input",
-        of,
-        (value,),
-        lambda at, p: at.own + p[0],
+        "input_offset", "input offset", "input", of, (value,), lambda at, p: at.own + p[0],
         f"{of} + {value.name}",
-    )
+    )  # fmt: skip
 
 
 def gain_by_direction(of: str, b: Parameter) -> Term:
@@ -976,27 +953,17 @@ def disturbance_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
 def output_gain(of: str, g: Parameter) -> Term:
     """A sensor of another gain: ``(1 + g) y``."""
     return _added(
-        "output_gain",
-        "sensor gain",
-        "output",
-        of,
-        (g,),
-        lambda at, p: (1.0 + p[0]) * at.own,
+        "output_gain", "sensor gain", "output", of, (g,), lambda at, p: (1.0 + p[0]) * at.own,
         f"(1 + {g.name}) {of}",
-    )
+    )  # fmt: skip
 
 
 def output_offset(of: str, value: Parameter) -> Term:
     """A sensor with an offset: ``y + offset``."""
     return _added(
-        "output_offset",
-        "sensor offset",
-        "output",
-        of,
-        (value,),
-        lambda at, p: at.own + p[0],
+        "output_offset", "sensor offset", "output", of, (value,), lambda at, p: at.own + p[0],
         f"{of} + {value.name}",
-    )
+    )  # fmt: skip
 
 
 def output_curve(of: str, bend: Parameter, *, lower: float, upper: float) -> Term:

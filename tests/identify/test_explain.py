@@ -24,7 +24,7 @@ from hybrid_mpc.identify import term_table
 from hybrid_mpc.identify.explain import _Explain, _Fitted, explain
 from hybrid_mpc.identify.explanation import Evidence, Explanation, HeldOutError, Trial
 from hybrid_mpc.identify.fit import smoothed
-from hybrid_mpc.identify.simulation import visited
+from hybrid_mpc.identify.simulation import Simulation, visited
 from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.machine import terms
 from hybrid_mpc.machine.terms import At, Term, extended
@@ -58,27 +58,12 @@ class Pendulum(MechanicalPrior):
 
 def recorded(prior, count=6, seconds=8.0, seed=0):
     """Runs of a plant from rest under torques that change every 0.3 s, each of its own size."""
-    rng, f, runs = np.random.default_rng(seed), prior.equations.xdot, []
-    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
-    h = DT / 10
-
-    def rates(at):
-        return f(at, u, [], prior.p)
-
-    one = x
-    for _ in range(10):
-        k1 = rates(one)
-        k2 = rates(one + h / 2 * k1)
-        k3 = rates(one + h / 2 * k2)
-        one = one + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(one + h * k3))
-    step = ca.Function("step", [x, u], [one])
+    rng, simulation, runs = np.random.default_rng(seed), Simulation(prior.equations.xdot, DT), []
     n = round(seconds / DT)
     for k in range(count):
         torque = np.repeat(rng.uniform(-1, 1, n // 15 + 1), 15)[:n, None] * (0.6 + 0.25 * k)
-        states = [np.zeros(2)]
-        for row in torque[:-1]:
-            states.append(step(states[-1], row).full().ravel())
-        y = np.array(states)[:, :1] + 1e-3 * rng.standard_normal((n, 1))
+        states = simulation.values(np.zeros((1, 2)), torque[None], np.zeros((1, n, 0)), prior.p, 10)[0]
+        y = states[:, :1] + 1e-3 * rng.standard_normal((n, 1))
         nothing = np.full((n, 2), np.nan)
         runs.append(Trajectory(f"run{k}", "train", DT, DT * np.arange(n), torque, y, nothing, nothing))
     return runs

@@ -13,13 +13,7 @@ from torch.func import jacfwd
 from hybrid_mpc import InputError, OperatingPoint, Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.export import trace_model
 from hybrid_mpc.identify.prior_model import model_info
-from hybrid_mpc.identify.simulation import (
-    Simulation,
-    required_substeps,
-    rest_of,
-    visited,
-    with_unknown_rates,
-)
+from hybrid_mpc.identify.simulation import Simulation, required_substeps, rest_of, visited, with_unknown_rates
 from hybrid_mpc.identify.step import PriorEquations, PriorStep, rk4
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.model.model import step_symbols
