@@ -1006,8 +1006,10 @@ class _Pictures:
         over, abscissa = self._over(term)
         order = np.argsort(over, kind="stable")
         data = self._left(term)
-        asked = () if data is None else _numbers((value + data)[order])
-        at, drawn, low, high = (_numbers(c[order]) for c in (over, value, value - spread, value + spread))
+        asked = () if data is None else tuple((value + data)[order].tolist())
+        at, drawn, low, high = (
+            tuple(c[order].tolist()) for c in (over, value, value - spread, value + spread)
+        )
         return TermPicture(abscissa, self._ordinate(term), at, drawn, low, high, asked)
 
     def _signal(self, name: str) -> tuple[Signal, Array]:
@@ -1086,7 +1088,3 @@ class _Pictures:
         if term.place == "output":
             return (self.y - self._shown())[:, _index(self.base, term)]
         return self._as_force(self.xdot - self._rates(self.values), term)
-
-
-def _numbers(values: Array) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)

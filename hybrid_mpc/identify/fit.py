@@ -231,7 +231,7 @@ def fit_prior(
         chosen = settled if after <= ENOUGH * before else chosen  # its updated weights may favour one output
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
-    answered = feedback(acting, smoother.prediction_errors(acting))
+    answered = feedback([t.u for t in acting], smoother.prediction_errors(acting))
     if fit.free and (answered > 1.0 or fit.reach(chosen.theta) < length):
         on_progress(total - 1, total, PREDICTIONS)
         known = [replace(t, x=s.x) for t, s in zip(acting, smoother.smooth(acting), strict=True)]

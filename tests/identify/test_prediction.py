@@ -41,7 +41,7 @@ def record(seed, *, gain, a=TRUTH["a"], disturbed=1.0, noise=0.01):
 def answered(runs):
     prior = First(TRUTH)
     smoother = fit_smoother(prior, runs, DT, time_unit=1.0)
-    return feedback(runs, smoother.prediction_errors(runs))
+    return feedback([run.u for run in runs], smoother.prediction_errors(runs))
 
 
 def test_feedback_is_told_from_open_loop():

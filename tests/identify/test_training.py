@@ -8,7 +8,7 @@ from simulated_pendulum import DT, SMALL, TRUTH, Pendulum, killed_and_resumed, s
 from hybrid_mpc import InputError, train
 from hybrid_mpc.identify import train as training
 from hybrid_mpc.identify.dataset import LONGEST, cut_windows, fitting_horizon, validation_horizon
-from hybrid_mpc.identify.objectives import objectives_of
+from hybrid_mpc.identify.objectives import OBJECTIVES, objectives_of
 from hybrid_mpc.identify.settings import KINDS
 from hybrid_mpc.identify.train import REPEATS, TrainingRun
 
@@ -190,3 +190,45 @@ def test_a_short_run_shortens_the_windows_and_too_short_ones_are_refused(data):
     assert fitting_horizon([long, cut(long, warm + 2)], warm, 20) == 10  # it does not drag the others down
     with pytest.raises(InputError, match="HM-IDENTIFY-005"):
         train(PRIOR, [cut(long, warm + 1)], data[1], SMALL)
+
+
+# options
+
+
+@pytest.mark.parametrize("options", [{"objectives": ("error",)}, {"prior_parameters": "trained"}], ids=str)
+def test_every_option_trains_resumes_and_makes_a_model(data, whole, options, tmp_path):
+    settings, file = replace(SMALL, **options), tmp_path / "training.safetensors"
+    trained = train(PRIOR, *data, settings)
+    assert (trained.validation < trained.curve["validation"][0]).all()
+    assert not trained.failures
+    same_training(trained, killed_and_resumed(10, file, PRIOR, *data, settings)[0])
+    assert not np.array_equal(trained.validation, whole.validation)
+    step = trained.step(PRIOR, DT)
+    x_next, h_next = step(
+        *(torch.zeros(n).double() for n in (2, step.network.n_h)),
+        torch.ones(1).double(),
+        torch.zeros(0).double(),
+    )
+    assert torch.isfinite(torch.cat([x_next, h_next])).all()
+
+
+def test_any_number_of_objectives(data, monkeypatch):
+    def square(step, p):
+        return (p.xdot_hat - p.xdot).square().sum(-1).mean(dim=(0, 2))
+
+    monkeypatch.setitem(OBJECTIVES, "square", square)
+    curve = train(PRIOR, *data, replace(SMALL, objectives=("error", "energy", "square"))).curve
+    for name in ("error", "energy", "square"):
+        assert (curve[f"loss_{name}"] > 0).all()
+        assert (np.diff(curve[f"bound_{name}"][curve["free_run"][:, 0] == 0], axis=0) <= 0).all()
+    two = train(PRIOR, *data, replace(SMALL, objectives=("error", "energy"))).curve
+    assert not np.array_equal(curve["loss_error"][1:], two["loss_error"][1:])  # the third one counts
+
+
+def test_teacher_forcing_takes_the_rates_where_free_runs_take_the_outputs(data):
+    settings = replace(SMALL, kind="pgrnn", free_run_steps=0)
+    rates, outputs = (
+        train(PRIOR, *data, replace(settings, objectives=(name,))) for name in ("error", "output")
+    )
+    np.testing.assert_array_equal(rates.curve["loss_error"], outputs.curve["loss_output"])
+    assert not np.array_equal(rates.curve["validation"], outputs.curve["validation"])  # each by its own
