@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from hybrid_mpc import Prior, Signal, Trajectory, fit_smoother
+from hybrid_mpc import InputError, Prior, Signal, Trajectory, fit_smoother
 from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.identify.horizon import HUBER, Horizon, Stretches, _Linearized
 from hybrid_mpc.identify.smooth import Smoother
@@ -133,6 +133,11 @@ def test_states_stay_within_bounds():
     assert found[:, 0].max() == top
     free = problem().solve(own, [np.zeros((N, 3))])
     assert problem().costs(own, found)[0] > problem().costs(own, free)[0]
+
+
+def test_equations_without_a_number_at_the_start_are_refused():
+    with pytest.raises(InputError, match="HM-IDENTIFY-020"):
+        problem().solve(stretch(1), [np.full((N, 3), np.nan)])
 
 
 class Runaway(Prior):
