@@ -526,8 +526,8 @@ def code_of(value: Option | Parameter) -> str:
         >>> code_of(Parameter("d", 0.0, "N s/m", 0.0, math.inf)), code_of(Signal("s", "N"))
         ("Parameter('d', 0.0, 'N s/m', 0.0, float('inf'))", "Signal('s', 'N')")
     """
-    if isinstance(value, float) and not math.isfinite(value):
-        return f"float('{value}')"
+    if isinstance(value, float):  # also numpy's, whose repr names numpy
+        return repr(float(value)) if math.isfinite(value) else f"float('{value}')"
     if isinstance(value, tuple):
         return f"({''.join(f'{code_of(one)}, ' for one in value).rstrip()})"
     if isinstance(value, Parameter):
