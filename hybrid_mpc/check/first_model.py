@@ -253,7 +253,7 @@ def feedback_of(runs: Sequence[Runs]) -> float:
         np.vstack([np.full((LAGS, run.y.shape[1]), np.nan), run.y[LAGS:] - _rows(run) @ fitted])
         for run in parts
     ]
-    return feedback(parts, errors)
+    return feedback([run.u for run in parts], errors)
 
 
 def growth_of(runs: Sequence[Runs], dt: float) -> float:

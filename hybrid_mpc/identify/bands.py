@@ -36,47 +36,15 @@ class RunParts:
 
     Args:
         error: Errors of the outputs ``(n, n_y)`` [output units]; NaN where nothing was measured.
-        parts: Parts of their variance ``(n, n_y, m)`` [output units^2], each not negative: see :func:`variance_parts`.
+        parts: Parts of their variance ``(n, n_y, m)`` [output units^2], each not negative: see :func:`run_variance`.
     """
 
     error: Array
     parts: Array
 
 
-def variance_parts(
-    t: Array,
-    sigma: Array,
-    spread: Array,
-    networks: Array,
-    parameters: Array,
-    *,
-    longest: float = math.inf,
-) -> Array:
-    """Parts of the variance of a free run's errors ``(n, n_y, 4)`` [output units^2].
-
-    Args:
-        t: Time since the start ``(n,)`` [s].
-        sigma: Standard deviation of the sensors' noise ``(n_y,)`` [output units].
-        spread: Spread of the outputs ``(n_y,)`` [output units].
-        networks: Variance between the networks ``(n, n_y)`` [output units^2]; zero for the prior.
-        parameters: Variance due to the covariance of the fitted parameters ``(n, n_y)`` [output units^2].
-        longest: Time [s] at which the growing part equals the squared spread; it grows further in a longer run.
-            Default: the length of the run.
-    """
-    n, n_y = networks.shape
-    growth = (np.asarray(t) / max(min(float(np.max(t)), longest), 1e-300))[:, None] * np.square(spread)
-    noise = np.broadcast_to(np.square(sigma), (n, n_y))
-    return np.stack([noise, networks, parameters, growth], axis=-1)
-
-
 def run_variance(
-    outputs: Array,
-    parameters: Array,
-    t: Array,
-    sigma: Array,
-    spread: Array,
-    *,
-    longest: float = math.inf,
+    outputs: Array, parameters: Array, t: Array, sigma: Array, spread: Array, *, longest: float = math.inf
 ) -> Array:
     """Parts of the variance of a free run's errors ``(n, n_y, 4)``, from the runs of all networks.
 
@@ -87,14 +55,16 @@ def run_variance(
         t: Time since the start ``(n,)`` [s].
         sigma: Standard deviation of the sensors' noise ``(n_y,)``.
         spread: Spread of the outputs ``(n_y,)``.
-        longest: As in :func:`variance_parts`.
+        longest: Time [s] at which the growing part equals the squared spread; it grows further in a longer run.
+            Default: the length of the run.
     """
     limit = np.square(FAR * spread)
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite variance
         networks = np.nan_to_num(outputs.var(axis=0), nan=np.inf)
-    return variance_parts(
-        t, sigma, spread, np.minimum(networks, limit), np.minimum(parameters, limit), longest=longest
-    )
+    networks, parameters = np.minimum(networks, limit), np.minimum(parameters, limit)
+    growth = (np.asarray(t) / max(min(float(np.max(t)), longest), 1e-300))[:, None] * np.square(spread)
+    noise = np.broadcast_to(np.square(sigma), networks.shape)
+    return np.stack([noise, networks, parameters, growth], axis=-1)
 
 
 def fit_bands(runs: Sequence[RunParts], share: float = SHARE) -> Bands:
@@ -156,9 +126,11 @@ def interval_score(run: RunParts, bands: Bands) -> Array:
 
     Source: Gneiting and Raftery, *Strictly proper scoring rules, prediction, and estimation*, JASA 102 (2007).
     """
-    half = bands.half_width(run.parts)
-    beyond = np.maximum(np.abs(run.error) - half, 0.0)
-    return np.asarray(np.nanmean(2 * half + 2 / (1 - bands.share) * beyond, axis=0))
+    return np.asarray(np.nanmean(_score(run.error, bands.half_width(run.parts), bands.share), axis=0))
+
+
+def _score(error: Array, half: Array, share: float) -> Array:
+    return np.asarray(2 * half + 2 / (1 - share) * np.maximum(np.abs(error) - half, 0.0))
 
 
 def _width_that_varies_is_better(pairs: Sequence[Pair], flat: Array, share: float) -> bool:
@@ -171,9 +143,7 @@ def _width_that_varies_is_better(pairs: Sequence[Pair], flat: Array, share: floa
         for i, own in enumerate((_weights(others), flat)):
             scale = _scale(others, own, share)
             for error, parts in them:
-                half = scale * _deviations(parts, own)
-                beyond = np.maximum(np.abs(error) - half, 0.0)
-                score[i] += np.mean(2 * half + 2 / (1 - share) * beyond)
+                score[i] += np.mean(_score(error, scale * _deviations(parts, own), share))
     return bool(score[0] < score[1])
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
-from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -17,12 +16,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit, delayed
 from hybrid_mpc.identify.shooting import OUTLIERS, Shooting
-from hybrid_mpc.identify.simulation import (
-    Simulation,
-    flow_slope,
-    rest_of,
-    with_unknown_rates,
-)
+from hybrid_mpc.identify.simulation import Simulation, flow_slope, rest_of, with_unknown_rates
 from hybrid_mpc.identify.smooth import Smoother, output_slope
 from hybrid_mpc.identify.windows import OutputWindows
 from hybrid_mpc.machine.prior import Equations
@@ -165,15 +159,7 @@ def fit_by_prediction(fit: OutputFit, theta: Array, windows: OutputWindows, smoo
     return Fitted(np.concatenate([found.theta[:n], theta[n:]]), covariance, known)
 
 
-class Driven(Protocol):
-    """A recording with its inputs ``(n, n_u)``."""
-
-    @property
-    def u(self) -> Array:
-        """Inputs."""
-
-
-def feedback(trajectories: Sequence[Driven], errors: Sequence[Array]) -> float:
+def feedback(inputs: Sequence[Array], errors: Sequence[Array]) -> float:
     """Test for feedback: largest correlation of inputs with earlier prediction errors, over its chance level.
 
     The part of an input that its own past does not predict is correlated with the prediction errors of the same sample
@@ -181,14 +167,14 @@ def feedback(trajectories: Sequence[Driven], errors: Sequence[Array]) -> float:
     feedback.
 
     Args:
-        trajectories: Recordings.
+        inputs: Inputs ``(n, n_u)`` of each recording.
         errors: Prediction errors ``(n, n_y)`` of each recording; NaN for a missing sample.
     """
     largest = 0.0
-    for j in range(trajectories[0].u.shape[1]):
+    for j in range(inputs[0].shape[1]):
         rows, answers = [], []
-        for t, e in zip(trajectories, errors, strict=True):
-            u = t.u[:, j]
+        for all_u, e in zip(inputs, errors, strict=True):
+            u = all_u[:, j]
             if len(u) <= 2 * PAST or not np.ptp(u) > 0:
                 continue
             past = np.stack([u[PAST - k - 1 : len(u) - k - 1] for k in range(PAST)], axis=1)

@@ -16,6 +16,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.dataset import in_parts
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import TrainingSettings
+from hybrid_mpc.identify.simulation import measured_as
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.sound import constant_runs, growth_time
 from hybrid_mpc.identify.step import PriorStep, Step
@@ -398,12 +399,6 @@ def _free_run(prior: Prior, trajectory: Trajectory, x_hat: Array, warm: int) -> 
         balances_hat=model,
         w=w,
     )
-
-
-def measured_as(prior: Prior, y: Array) -> Array:
-    """Clip outputs ``(..., n_y)`` to the sensors' declared ranges."""
-    ends = [s.saturation or (-np.inf, np.inf) for s in prior.outputs]
-    return np.asarray(np.clip(y, [low for low, _ in ends], [high for _, high in ends]))
 
 
 def _padded(values: Array, length: int) -> Array:

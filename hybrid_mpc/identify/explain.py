@@ -38,14 +38,14 @@ from hybrid_mpc.identify.explanation import (
 )
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit
-from hybrid_mpc.identify.shooting import Shooting
+from hybrid_mpc.identify.shooting import Shooting, bounded_step
 from hybrid_mpc.identify.simulation import Points, visited
 from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.identify.windows import OutputWindows, cut_outputs
 from hybrid_mpc.machine.mechanical import MechanicalPrior
-from hybrid_mpc.machine.prior import Prior, named
+from hybrid_mpc.machine.prior import POINT, Prior, named
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.machine.terms import At, Term, extended
+from hybrid_mpc.machine.terms import At, Term, extended, signals_at
 from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
@@ -207,52 +207,32 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
     }
     windows = replace(parts[0], **joined, group=np.arange(len(of)))
     recording, present = np.array(of), sorted(set(of))
-    groups, length = min(FOLDS, len(present)), periods * known[0].dt
-    folds = np.zeros(len(of), dtype=np.int64)
-    if groups > 1:
-        order = _by_kind(windows, recording, present)
+    if len(present) > 1:
+        order, groups = _by_kind(windows, recording, present), min(FOLDS, len(present))
         fold = dict(zip(order, np.arange(len(order)) * groups // len(order), strict=True))
         folds = np.array([fold[own] for own in of])
-    samples = windows.y.shape[1]
-    warm = min(warm, samples // 3)
-    if len(present) >= MANY:
-        pieces = np.repeat(recording[:, None], samples, axis=1)
-        text = f"{len(present)} recordings in {groups} groups"
-        return _HeldOut(
-            windows,
-            tuple(starts),
-            pieces,
-            folds,
-            Evidence(len(present), len(present), groups, length, text),
-            warm,
-        )
-    lasting = MEMORY * time_unit(known, known[0].dt) / known[0].dt
-    pieces, count, blocks_of = (
-        np.zeros((len(of), samples), dtype=np.int64),
-        0,
-        np.zeros(len(of), dtype=np.int64),
-    )
-    for recorded in present:  # a few recordings are cut into blocks as pieces of evidence
-        at = np.flatnonzero(recording == recorded)
-        whole = len(at) * samples
-        most = max(FEWEST / len(present), min(BLOCKS / len(present), whole / lasting))
-        blocks = max(1, min(math.ceil(most), whole // SHORTEST))
-        pieces[at] = (count + np.arange(whole) * blocks // whole).reshape(len(at), samples)
-        blocks_of[at] = np.arange(len(at))
-        count += blocks
-    if groups == 1:
+    else:
         groups = min(FOLDS, len(of))
-        folds = blocks_of * groups // len(of)
-    if count < FEWEST or groups < 2:
-        raise InputError(
-            f"{len(present)} recording of {whole} samples is too little evidence for terms: record at least one more "
-            f"like it, or one of {2 * samples} samples and more [HM-IDENTIFY-011]"
-        )
-    what = "one recording" if len(present) == 1 else f"{len(present)} recordings"
-    text = f"{count} blocks of {what} in {groups} groups"
-    return _HeldOut(
-        windows, tuple(starts), pieces, folds, Evidence(len(present), count, groups, length, text), warm
-    )
+        folds = np.arange(len(of)) * groups // len(of)
+    samples, text = windows.y.shape[1], "one recording" if len(present) == 1 else f"{len(present)} recordings"
+    pieces, count = np.repeat(recording[:, None], samples, axis=1), len(present)
+    if len(present) < MANY:  # a few recordings are cut into blocks as pieces of evidence
+        lasting, count = MEMORY * time_unit(known, known[0].dt) / known[0].dt, 0
+        for recorded in present:
+            at = np.flatnonzero(recording == recorded)
+            whole = len(at) * samples
+            most = max(FEWEST / len(present), min(BLOCKS / len(present), whole / lasting))
+            blocks = max(1, min(math.ceil(most), whole // SHORTEST))
+            pieces[at] = (count + np.arange(whole) * blocks // whole).reshape(len(at), samples)
+            count += blocks
+        if count < FEWEST or groups < 2:
+            raise InputError(
+                f"{len(present)} recording of {whole} samples is too little evidence for terms: record at least one "
+                f"more like it, or one of {2 * samples} samples and more [HM-IDENTIFY-011]"
+            )
+        text = f"{count} blocks of {text}"
+    summary = Evidence(len(present), count, groups, periods * known[0].dt, f"{text} in {groups} groups")
+    return _HeldOut(windows, tuple(starts), pieces, folds, summary, min(warm, samples // 3))
 
 
 def _by_kind(windows: OutputWindows, pieces: Places, present: Sequence[int]) -> list[int]:
@@ -298,13 +278,17 @@ class _Search:
 
     def with_states(self, terms: Terms, points: Points) -> Points:
         """Points with the terms' states; each of these states equals its signal."""
+        added = [self._signal_of(term, points, self.base().p) for term in _with_state(terms)]
+        return np.column_stack([points[0], *added]), *points[1:]
+
+    def _signal_of(self, term: Term, points: Points, p: Array) -> Array:
+        """Values ``(n,)`` of a term's signal at points."""
         x, u, w = points
-        prior = self.base()
-        signals = {"rate": x, "input": u, "disturbance": w}
-        if any(term.place == "output" for term in _with_state(terms)):
-            signals["output"] = prior.equations.output(x.T, u.T, w.T, prior.p).full().T
-        added = [signals[t.place][:, _index(self.base, t)] for t in _with_state(terms)]
-        return np.column_stack([x, *added]), u, w
+        if term.place == "output":
+            values = self.base().equations.output(x.T, u.T, w.T, p).full().T
+        else:
+            values = {"input": u, "disturbance": w}.get(term.place, x)
+        return np.asarray(values[:, _index(self.base, term)])
 
     def problem(self, terms: Terms, windows: OutputWindows) -> Shooting:
         """Shooting problem for the fit of the prior with terms."""
@@ -351,42 +335,21 @@ class _Search:
 
     def _along(self, term: Term, trajectory: Trajectory, values: dict[str, float]) -> Array:
         """Simulate a term's state along a recording ``(n,)``; it starts at the first value of its signal."""
-        prior = self.base()
-        x, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in ("x", "u", "w", "p"))
-        state, given = ca.SX.sym("s"), ca.SX.sym("q", len(term.parameters))
-        k = _index(self.base, term)
-        own = {"rate": x, "input": u, "disturbance": w}.get(term.place)
-        own = prior.equations.output(x, u, w, p)[k] if own is None else own[k]
-        names = (
-            named(prior.names_of(key), ca.vertsplit(v)) for key, v in zip("xuwp", (x, u, w, p), strict=True)
-        )
-        x_named, u_named, w_named, p_named = names
-        at = At(
-            x=x_named,
-            u=u_named,
-            w=w_named,
-            own=own,
-            position=None,
-            driven=0.0,
-            resting=0.0,
-            state=state,
-            p=p_named,
-        )
-        rate = term.law(at, named(term.names, ca.vertsplit(given)))[1]
-        f = ca.Function("rate", [state, x, u, w, given, p], [rate])
+        prior, n = extended(self.base, term)(), len(trajectory.t)
+        z, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in POINT)
+        x, state = z[:-1], z[-1]  # the term's state is the last one
+        rate = ca.Function("rate", [z, u, w, p], [prior.equations.xdot(z, u, w, p)[-1]])
         h, one = self.dt / ALONG, state
         for _ in range(ALONG):
-            half = one + 0.5 * h * f(one, x, u, w, given, p)
-            one = one + h * f(half, x, u, w, given, p)
-        step = ca.Function("step", [state, x, u, w, given, p], [one]).mapaccum(len(trajectory.t))
-        start = ca.Function("own", [x, u, w, p], [own])
-        base = ca.DM([values[q.name] for q in self.base.parameters])
-        mine = ca.DM([values[name] for name in term.names])
-        columns = [np.nan_to_num(getattr(trajectory, key)).T for key in ("x", "u", "w")]
-        first = start(*(ca.DM(c[:, :1]) for c in columns), base)
-        n = len(trajectory.t)
-        found = step(first, *columns, ca.repmat(mine, 1, n), ca.repmat(base, 1, n)).full().ravel()
-        return np.concatenate([first.full().ravel(), found[:-1]])
+            half = one + 0.5 * h * rate(ca.vertcat(x, one), u, w, p)
+            one = one + h * rate(ca.vertcat(x, half), u, w, p)
+        step = ca.Function("step", [state, x, u, w, p], [one]).mapaccum(n)
+        own_p = np.array([values[name] for name in prior.names_of("p")])
+        columns = [np.nan_to_num(getattr(trajectory, key)) for key in ("x", "u", "w")]
+        x_0, u_0, w_0 = (c[:1] for c in columns)
+        first = self._signal_of(term, (x_0, u_0, w_0), own_p[: len(self.base.parameters)])
+        found = step(first, *(c.T for c in columns), np.tile(own_p[:, None], n)).full().ravel()
+        return np.concatenate([first, found[:-1]])
 
     def held_out(self, terms: Terms, theta: Array) -> Array:
         """Squared errors ``(n, T + 1)`` of every window with a fit to the other folds, which starts from ``theta``."""
@@ -497,7 +460,9 @@ class _Promises:
     def _left(self, columns: list[int]) -> float:
         cost = 0.0
         for fitted, own in zip(self.fitted, self.held, strict=True):
-            step = _step(fitted, columns, self.low, self.high)
+            matrix = fitted[np.ix_(columns, columns)]
+            matrix = matrix + RIDGE * np.diag(np.diag(matrix) + 1e-300)
+            step = bounded_step(matrix, fitted[columns, -1], self.low[columns], self.high[columns])
             moved = own[np.ix_(columns, columns)] @ step
             cost += own[-1, -1] + 2.0 * float(own[columns, -1] @ step) + float(step @ moved)
         return max(cost, 1e-300)
@@ -526,28 +491,7 @@ def _vanishes(term: Term) -> bool:
 
 def _index(base: type[Prior], term: Term) -> int:
     """Index of a term's signal among the signals of its kind."""
-    groups: dict[str, tuple[Signal, ...]] = {
-        "input": base.inputs, "disturbance": base.disturbances, "output": base.outputs,
-    }  # fmt: skip
-    return [s.name for s in groups.get(term.place, base.states)].index(term.of)
-
-
-def _step(normal: Array, columns: list[int], low: Array, high: Array) -> Array:
-    """Bounded Gauss-Newton step of some columns; components that would leave their bounds are fixed there."""
-    matrix, slope = normal[np.ix_(columns, columns)], normal[columns, -1]
-    matrix = matrix + RIDGE * np.diag(np.diag(matrix) + 1e-300)
-    step, free = np.zeros(len(columns)), np.ones(len(columns), dtype=bool)
-    for _ in range(len(columns)):
-        own = matrix[np.ix_(free, free)]
-        step[free] = -np.linalg.lstsq(
-            own, slope[free] + matrix[np.ix_(free, ~free)] @ step[~free], rcond=None
-        )[0]
-        clipped = np.clip(step, low[columns], high[columns])
-        beyond = free & (clipped != step)
-        if not beyond.any():
-            break
-        step, free = np.where(beyond, clipped, step), free & ~beyond
-    return step
+    return [s.name for s in signals_at(base, term.place)].index(term.of)
 
 
 def _squares(problem: Shooting, theta: Array) -> Array:
@@ -557,9 +501,10 @@ def _squares(problem: Shooting, theta: Array) -> Array:
     """
     point = problem.start(theta, problem.first_states(theta), "")
     shape = problem.windows.y.shape
-    over = np.clip(point.error / np.tile(problem.spread, shape[1]), -REACH, REACH) * problem.count
     seen = problem.seen.sum(axis=-1)
-    return np.asarray(np.square(over).reshape(shape).sum(axis=-1) / np.maximum(seen, 1.0))
+    return np.asarray(
+        np.square(problem.relative(point, REACH)).reshape(shape).sum(axis=-1) / np.maximum(seen, 1.0)
+    )
 
 
 @dataclass(frozen=True)
@@ -638,17 +583,7 @@ def explain(
         InputError: If there are too few recordings to evaluate terms, two terms have the same name, or a user's term
             does not match the prior, its units or its balances.
     """
-    found = _Explain(
-        base=base,
-        values=values,
-        known=known,
-        dt=dt,
-        length=length,
-        warm_up=warm_up,
-        candidates=candidates,
-        own=own,
-        on_progress=on_progress,
-    )
+    found = _Explain(base, values, known, dt, length, warm_up, candidates, own, on_progress)
     return found.run(begun, most, on_step)
 
 
@@ -671,9 +606,8 @@ class _Explain:
         self.base, self.known, self.own, self.on_progress = base, known, tuple(own), on_progress
         ends = {name: max(len(t.t) for t in known if t.file == name) - 1 for name in {t.file for t in known}}
         longest = min(periods_of(length, dt, 2), max(ends.values()))
-        longest = min(
-            end for end in ends.values() if 2 * end >= longest
-        )  # at least half the requested length, so that shorter recordings are used too
+        # at least half the requested length, so that shorter recordings are used too
+        longest = min(end for end in ends.values() if 2 * end >= longest)
         if len({t.file for t in known}) == 1:  # pieces of evidence are parts of the recording
             samples = sum(len(t.t) for t in known)
             longest = samples // BLOCKS - 1
@@ -745,11 +679,8 @@ class _Explain:
             both = list(self._fitted(some, f"step {number}, pairs"))
             fitted += both
             chosen = _chosen([one for one in both if self._both_needed(one)])
-        return (
-            tuple([self._trial(one, chosen) for one in fitted] + diverged),
-            len(self.pool),
-            chosen,
-        )
+        trials = [self._trial(one, chosen) for one in fitted] + diverged
+        return tuple(trials), len(self.pool), chosen
 
     def _scored(self, number: int) -> tuple[_Ranked, _Ranked, list[Trial]]:
         """Single terms and pairs with the logarithm of their predicted ratio of errors, and failed candidates."""
@@ -772,9 +703,8 @@ class _Explain:
         ends = search.error(now.terms, now.theta)
         diverged = []
         slow = [one for one in self.pool if not _vanishes(one.forms[0])]
-        for i, one in enumerate(
-            slow, 1
-        ):  # a lag acts at its nominal values, so derivatives do not predict its effect
+        # a lag acts at its nominal values, so derivatives do not predict its effect
+        for i, one in enumerate(slow, 1):
             scores = []
             for form in one.forms:
                 try:
@@ -1076,8 +1006,10 @@ class _Pictures:
         over, abscissa = self._over(term)
         order = np.argsort(over, kind="stable")
         data = self._left(term)
-        asked = () if data is None else _numbers((value + data)[order])
-        at, drawn, low, high = (_numbers(c[order]) for c in (over, value, value - spread, value + spread))
+        asked = () if data is None else tuple((value + data)[order].tolist())
+        at, drawn, low, high = (
+            tuple(c[order].tolist()) for c in (over, value, value - spread, value + spread)
+        )
         return TermPicture(abscissa, self._ordinate(term), at, drawn, low, high, asked)
 
     def _signal(self, name: str) -> tuple[Signal, Array]:
@@ -1103,12 +1035,9 @@ class _Pictures:
         return values, signal.label
 
     def _ordinate(self, term: Term) -> str:
+        unit = signals_at(self.base, term.place)[_index(self.base, term)].unit
         if term.place in ("input", "disturbance", "output"):
-            groups = {
-                "input": self.base.inputs, "disturbance": self.base.disturbances, "output": self.base.outputs,
-            }  # fmt: skip
-            return f"{term.name} [{groups[term.place][_index(self.base, term)].unit}]"
-        unit = self.base.states[_index(self.base, term)].unit
+            return f"{term.name} [{unit}]"
         if term.place == "rate":
             return f"{term.name} [{unit}/s]"
         return f"{term.name} [{'N' if unit.startswith('m') else 'N m'}]"
@@ -1145,17 +1074,10 @@ class _Pictures:
             k = _index(self.base, term)
             return (self._shown(values) - self._shown(zero))[:, k]
         if term.place in ("input", "disturbance"):
-            signals = (
-                (self.base.states, self.bare_x), (self.base.inputs, self.u), (self.base.disturbances, self.w),
-            )  # fmt: skip
-            x, u, w = (named(tuple(s.name for s in group), [ca.DM(c) for c in of.T]) for group, of in signals)
-            own = ca.DM(self._signal(term.of)[1])
-            base = named(tuple(p.name for p in self.parameters[: self.n_p]), list(self.values[: self.n_p]))
+            point = [ca.DM(v) for v in (self.bare_x.T, self.u.T, self.w.T, self.values[: self.n_p])]
+            own = ca.DM(self._signal(term.of)[1]).T
             given = [float(v) for v, p in zip(values, self.parameters, strict=True) if p.name in term.names]
-            acting = term.law(
-                At(x=x, u=u, w=w, own=own, position=None, driven=0.0, resting=0.0, state=None, p=base),
-                named(term.names, given),
-            )
+            acting = term.law(At.of(self.base(), point, own), named(term.names, given))
             return np.asarray((acting - own).full().ravel())
         return self._as_force(self._rates(values) - self._rates(zero), term)
 
@@ -1166,7 +1088,3 @@ class _Pictures:
         if term.place == "output":
             return (self.y - self._shown())[:, _index(self.base, term)]
         return self._as_force(self.xdot - self._rates(self.values), term)
-
-
-def _numbers(values: Array) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -77,11 +76,13 @@ class HeldOutError:
         """Ratio with its interval.
 
         Example:
-            >>> HeldOutError(0.1, 0.954, 0.8, 1.13, 0.2).words, HeldOutError(0.1, 0.954, 0.0, math.inf, 1.0).words
+            >>> HeldOutError(0.1, 0.954, 0.8, 1.13, 0.2).words, HeldOutError(0.1, 0.954, 0.0, float("inf"), 1.0).words
             ('0.95 (0.80 to 1.13)', '0.95 (no upper end)')
         """
-        ends = f"{self.lower:.2f} to {self.upper:.2f}" if self.lower > 0.0 else _bound(self.upper)
-        return f"{self.ratio:.2f} ({ends})"
+        if self.lower > 0.0:
+            return f"{self.ratio:.2f} ({self.lower:.2f} to {self.upper:.2f})"
+        end = f"upper end {self.upper:.2f}" if self.upper < 1e6 else "no upper end"
+        return f"{self.ratio:.2f} ({end})"
 
 
 @dataclass(frozen=True)
@@ -314,13 +315,3 @@ class Explanation:
 
 def _named(terms: Sequence[FoundTerm]) -> str:
     return " and ".join(term.name for term in terms)
-
-
-def _bound(upper: float) -> str:
-    """Text of the upper end of an interval.
-
-    Example:
-        >>> _bound(0.912), _bound(math.inf)
-        ('upper end 0.91', 'no upper end')
-    """
-    return f"upper end {upper:.2f}" if math.isfinite(upper) and upper < 1e6 else "no upper end"

@@ -122,9 +122,8 @@ def fit_prior(
     """
     if first_states.kind not in ("known", "shared"):  # these belong to the first sample of each trajectory
         train, valid = continued(train), continued(valid)
-    train, valid = (
-        sorted(part, key=place_among) for part in (train, valid)
-    )  # so that the order of files does not matter
+    # the order of files does not matter
+    train, valid = (sorted(part, key=place_among) for part in (train, valid))
     fit = OutputFit(make, dt, largest_delay)
     unit = scales.time_unit(train, dt) if time_unit is None else time_unit
     check_observable(fit.prior, dt, unit)
@@ -207,12 +206,10 @@ def fit_prior(
                 problem, scoring = longer, parts_of(None)
                 found.append(("whole recordings", [solution], longer))
     candidates = [("nominal", Fitted(fit.nominal, np.zeros((0, 0)), ()))]
-    problems = {}
-    for name, solved, problems[
-        name
-    ] in found:  # of each length the result that is best over the longest windows
+    for name, solved, _ in found:  # of each length the result that is best over the longest windows
         errors = _errors_of([one.theta for one in solved], scoring)
         candidates.append((name, solved[int(np.argmin(errors))]))
+    problems = {name: problem for name, _, problem in found}
     scores = _errors_of([c.theta for _, c in candidates], scoring)
     on_progress(total - 1, total, "smoothing with the fitted prior")
 
@@ -234,7 +231,7 @@ def fit_prior(
         chosen = settled if after <= ENOUGH * before else chosen  # its updated weights may favour one output
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
-    answered = feedback(acting, smoother.prediction_errors(acting, smoother.prior.p[None])[1])
+    answered = feedback([t.u for t in acting], smoother.prediction_errors(acting))
     if fit.free and (answered > 1.0 or fit.reach(chosen.theta) < length):
         on_progress(total - 1, total, PREDICTIONS)
         known = [replace(t, x=s.x) for t, s in zip(acting, smoother.smooth(acting), strict=True)]

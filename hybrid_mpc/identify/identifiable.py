@@ -68,9 +68,8 @@ def covariance(
     _, values, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
     told = np.zeros(k)
     told[: len(values)] = np.where(values > ROUNDED * values[0], values, 0.0)
-    back = (
-        directions.T * half[:, None]
-    )  # theta = back @ c, with coordinates c whose information is diag(told^2)
+    # theta = back @ c, with coordinates c whose information is diag(told^2)
+    back = directions.T * half[:, None]
     scores = (slopes * error[..., None]).reshape(n, -1, outputs, k).sum(axis=2)
     parts = min(math.ceil(CLUSTERS / n), scores.shape[1])
     begins = np.arange(parts) * scores.shape[1] // parts

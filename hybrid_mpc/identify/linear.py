@@ -450,20 +450,17 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
         f"{role} recording {i + 1}": _signals(r)
         for role, recordings in (("training", train), ("validation", valid)) for i, r in enumerate(recordings)
     }  # fmt: skip
-    first = next(iter(pairs.values()))
+    columns = [np.shape(v)[1:] for v in next(iter(pairs.values()))]
     for name, (y, u) in pairs.items():
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or not y.shape[1] or not u.shape[1]:
             problems.append(
                 f"{name}: y has the shape {y.shape}, u {u.shape}; give (n, n_y) and (n, n_u), one row for each sample"
                 " [HM-IDENTIFY-030]"
             )
-        elif first[0].ndim == 2 == first[1].ndim and (y.shape[1], u.shape[1]) != (
-            first[0].shape[1],
-            first[1].shape[1],
-        ):
+        elif [len(shape) for shape in columns] == [1, 1] and [y.shape[1:], u.shape[1:]] != columns:
             problems.append(
                 f"{name}: {y.shape[1]} outputs and {u.shape[1]} inputs (with measured disturbances); training "
-                f"recording 1 has {first[0].shape[1]} and {first[1].shape[1]}; give all recordings the same columns"
+                f"recording 1 has {columns[0][0]} and {columns[1][0]}; give all recordings the same columns"
                 " [HM-IDENTIFY-031]"
             )
         elif not np.isfinite(u).all():
@@ -759,25 +756,9 @@ def _model(
     name: str, data: _Data, dt: float, a: Array, b: Array, c: Array, d: Array, k: Array, bias: Array, noise: Array,
     spread: Array, tried: tuple[int, int, int], doubts: tuple[str, ...],
 ) -> LinearModel:  # fmt: skip
-    return LinearModel(
-        name=name,
-        dt=float(dt),
-        A=a,
-        B=b,
-        C=c,
-        D=d,
-        K=k,
-        bias=bias,
-        noise=noise,
-        spread=spread,
-        u_centre=data.u_centre,
-        u_scale=data.u_scale,
-        y_centre=data.y_centre,
-        y_scale=data.y_scale,
-        chosen=Candidate(*tried, math.nan, _radius(a)),
-        candidates=(),
-        warnings=doubts,
-    )
+    scales = data.u_centre, data.u_scale, data.y_centre, data.y_scale
+    chosen = Candidate(*tried, math.nan, _radius(a))
+    return LinearModel(name, float(dt), a, b, c, d, k, bias, noise, spread, *scales, chosen, (), doubts)
 
 
 def _error(model: LinearModel, recordings: Sequence[Measured], warm: int) -> float:

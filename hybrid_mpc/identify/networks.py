@@ -53,14 +53,7 @@ class StackedGRU(nn.Module):
     """
 
     def __init__(
-        self,
-        networks: int,
-        n_in: int,
-        hidden: int,
-        n_out: int,
-        *,
-        seed: int,
-        zero_head: bool = False,
+        self, networks: int, n_in: int, hidden: int, n_out: int, *, seed: int, zero_head: bool = False
     ) -> None:
         super().__init__()
         self.networks, self.n_in, self.n_h, self.n_out = networks, n_in, hidden, n_out

@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.identify.delay import NONE
-from hybrid_mpc.identify.simulation import (
-    Points,
-    Simulation,
-    growth_rate,
-    required_substeps,
-)
+from hybrid_mpc.identify.simulation import Points, Simulation, growth_rate, required_substeps
 from hybrid_mpc.identify.windows import OutputWindows
 from hybrid_mpc.machine.prior import Prior
 

@@ -140,16 +140,12 @@ def fit_each(
             delays.append(fitted_delay(every, every.scaled(thetas[-1]), [Shooting(late, windows, sizes)]))
     surely = [one for one in delays if one is not None and one.surely]
     return OwnFits(
-        tuple(_name(part[0], i, varying.blocks) for i, part in enumerate(pieces)),
+        tuple(f"block {i}" if varying.blocks else part[0].file for i, part in enumerate(pieces, 1)),
         varying,
         {name: tuple(theta[name] for theta in thetas) for name in varying.names},
         math.sqrt(float(squares[1] / max(squares[0], 1e-300))),
         tuple(surely) if len(surely) == len(pieces) else (),
     )
-
-
-def _name(t: Trajectory, number: int, block: bool) -> str:
-    return f"block {number + 1}" if block else t.file
 
 
 def _span(values: Sequence[float]) -> str:

@@ -16,6 +16,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.bands import run_variance
 from hybrid_mpc.identify.delay import lost_samples, shifted
 from hybrid_mpc.identify.fit import parameter_variance
+from hybrid_mpc.identify.simulation import measured_as
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.prediction import SHARE, Predicting
@@ -172,7 +173,9 @@ def _banded(
     u, w, t = run.u[shown], run.w[shown], run.t[shown]
     networks = [*kit.members.values()] if name == "hybrid" else []
     states = [_free_run(one, commanded, x, lost, warm) for one in (chosen, *networks)]
-    outputs = np.stack([_outputs(prior, own, u, w) for own in states])
+    output = prior.equations.output
+    shown_y = [output(own.T, u.T, w.T, prior.p).full().T for own in states]
+    outputs = measured_as(prior, np.stack(shown_y))
     bands = held.bands.get(name)
     if bands is None:
         return outputs[0], np.full(outputs[0].shape, np.nan)
@@ -241,13 +244,6 @@ def _free_run(model: HybridModel, whole: Trajectory, x: Array, lost: int, warm: 
         step()
         h = step.outputs[1].copy()
     return states
-
-
-def _outputs(prior: Prior, x: Array, u: Array, w: Array) -> Array:
-    """Outputs ``(n, n_y)``, clipped to the sensors' declared ranges."""
-    ends = np.array([s.saturation or (-np.inf, np.inf) for s in prior.outputs]).T
-    y = prior.equations.output(x.T, u.T, w.T, prior.p).full().T
-    return np.asarray(np.clip(y, *ends))
 
 
 def _one_step(kit: Kit, name: str, recording: Trajectory) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ Source: Bock, *Recent advances in parameter identification techniques for O.D.E.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,6 +104,12 @@ class _Point:
         """Scale of each error of a window."""
         return np.tile(self.scale, self.error.shape[1] // len(self.scale))
 
+    @property
+    def robust(self) -> Array:
+        """Robust cost of each error."""
+        c2, over = OUTLIERS**2, np.minimum(np.abs(self.error / self.scales), self.far)
+        return np.asarray(2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1))
+
     def where(self, better: NDArray[np.bool_], other: _Point) -> _Point:
         """Replace windows by those of ``other`` where ``better``."""
         own, new = ((p.x, p.error, p.slopes) for p in (self, other))
@@ -155,15 +161,17 @@ class Shooting:
                 begun = Shooting(self.own, problem.windows.beginning(periods), self.sizes, self.spread)
                 x = begun._states(begun.start(np.stack(some), x, "x")).x
             point = problem._states(problem.start(np.stack(some), x, "x"))
-            over = (
-                np.clip(point.error / np.tile(self.spread, problem.windows.y.shape[1]), -FAR, FAR)
-                * self.count
-            )
+            over = self.relative(point, FAR)
             for i, theta in enumerate(some):
                 part = slice(i * n, (i + 1) * n)
                 error = float(np.sqrt(np.square(over[part]).sum() / share))
                 self._known[theta.tobytes()] = error, point.x[part]
         return [self._known[theta.tobytes()][0] for theta in thetas]
+
+    def relative(self, point: _Point, far: float) -> Array:
+        """Counted errors ``(n, (T + 1) n_y)`` in spreads of the outputs, each at most ``far``."""
+        spreads = np.tile(self.spread, self.windows.y.shape[1])
+        return np.asarray(np.clip(point.error / spreads, -far, far) * self.count)
 
     def _growing(self, thetas: Sequence[Array]) -> list[int]:
         """Increasing lengths [periods] over which initial states are estimated before the whole windows.
@@ -190,7 +198,7 @@ class Shooting:
             point = self._descend(point, min(iterations, FIRST))
             # maximum number of times that the scales are estimated again; outliers hide small residuals at first
             for k in range(4):
-                rescaled = replace(point, scale=self._left(point.error), held=1.0)
+                rescaled = self._rescaled(point)
                 # ratio of new to old scales below which they are estimated again
                 if k and (rescaled.scale > 0.8 * point.scale).all():
                     break
@@ -199,27 +207,19 @@ class Shooting:
                 point = self._descend(replace(point, far=GROSS), iterations)
         return Fitted(point.theta, *self._covariance(point))
 
-    def several(
-        self,
-        thetas: Array,
-        each: Callable[[Sequence[int]], OutputFit],
-        keep: Sequence[int],
-        free: int | None = None,
-    ) -> list[Trial]:
-        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs; the worst ones end early.
+    def several(self, fit: OutputFit, thetas: Array, steps: int, free: int | None = None) -> list[Trial]:
+        """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs.
 
         Args:
+            fit: The fit of several ``thetas``, whose windows lie one behind the other.
             thetas: Starts.
-            each: Returns the fit for the starts of given numbers, whose windows lie one behind the other.
-            keep: Number of starts that continue, after each two steps.
+            steps: Pairs of Gauss-Newton steps; 0: only initial states are fitted.
             free: Number of fitted parameters, from the first one on. Default: all.
         """
-        alive, n = list(range(len(thetas))), len(self.windows.x)
-        damping = np.full(len(thetas), DAMPING)
+        m, n = len(thetas), len(self.windows.x)
+        damping = np.full(m, DAMPING)
         share = max(1.0, float((self.seen.reshape(n, -1) * self.count).sum()))
-
-        def many(numbers: Sequence[int]) -> Shooting:
-            return Shooting(each(numbers), self.windows.times(len(numbers)), self.sizes, self.spread)
+        problem = Shooting(fit, self.windows.times(m), self.sizes, self.spread)
 
         def parts(point: _Point) -> list[_Point]:
             rows = [slice(i * n, (i + 1) * n) for i in range(len(point.theta))]
@@ -228,47 +228,29 @@ class Shooting:
                 for theta, r in zip(point.theta, rows, strict=True)
             ]
 
-        problem = many(alive)
         begun = problem._states(problem.start(thetas, problem.windows.x, "x"))
-        point = problem._at(begun, thetas, begun.x, "all") if keep else begun
-        found = dict(zip(alive, parts(point), strict=True))
-        for left in keep:
-            for _ in range(2):
-                steps = []
-                for k in alive:
-                    xx, xt, tt, gx, gt = self._normal(found[k])
-                    normal = xx, xt[..., :free], tt[:free, :free], gx, gt[:free]
-                    step, moved, _ = self._step(normal, damping[k], found[k].theta[:free])
-                    steps.append((np.pad(step, (0, thetas.shape[1] - len(step))), moved))
-                theta = np.stack([
-                    np.clip(found[k].theta + step, self.own.lower, self.own.upper)
-                    for k, (step, _) in zip(alive, steps, strict=True)
-                ])  # fmt: skip
-                x = np.concatenate([
-                    found[k].x + moved[self.windows.group] * self.sizes
-                    for k, (_, moved) in zip(alive, steps, strict=True)
-                ])  # fmt: skip
-                trials = parts(many(alive)._at(begun, theta, x, "all"))
-                for k, trial in zip(alive, trials, strict=True):
-                    better = self._cost(trial) < self._cost(found[k])
-                    found[k] = trial if better else found[k]
-                    damping[k] *= 0.2 if better else 5.0
-            alive = sorted(alive, key=lambda k: self._cost(found[k]))[:left]
-        over = {
-            k: np.clip(found[k].error / np.tile(self.spread, self.windows.y.shape[1]), -FAR, FAR)
-            for k in alive
-        }
-        return [
-            Trial(k, found[k].theta, math.sqrt(float(np.square(over[k] * self.count).sum()) / share))
-            for k in alive
-        ]
+        found = parts(problem._at(begun, thetas, begun.x, "all") if steps else begun)
+        for _ in range(2 * steps):
+            theta, x = [], []
+            for one, damped in zip(found, damping, strict=True):
+                xx, xt, tt, gx, gt = self._normal(one)
+                normal = xx, xt[..., :free], tt[:free, :free], gx, gt[:free]
+                step, moved, _ = self._step(normal, damped, one.theta[:free])
+                further = one.theta + np.pad(step, (0, thetas.shape[1] - len(step)))
+                theta.append(np.clip(further, self.own.lower, self.own.upper))
+                x.append(one.x + moved[self.windows.group] * self.sizes)
+            for k, trial in enumerate(parts(problem._at(begun, np.stack(theta), np.concatenate(x), "all"))):
+                better = self._cost(trial) < self._cost(found[k])
+                found[k] = trial if better else found[k]
+                damping[k] *= 0.2 if better else 5.0
+        errors = (math.sqrt(float(np.square(self.relative(one, FAR)).sum()) / share) for one in found)
+        return [Trial(k, one.theta, e) for k, (one, e) in enumerate(zip(found, errors, strict=True))]
 
     def settled(self, theta: Array) -> Fitted:
         """Continue the fit to full convergence, so that the result depends neither on the start nor on rounding."""
         point = self.start(theta, self.first_states(theta), "all")
         for _ in range(2):
-            rescaled = replace(point, scale=self._left(point.error), held=1.0)
-            point = self._descend(rescaled, ITERATIONS, CLOSELY)
+            point = self._descend(self._rescaled(point), ITERATIONS, CLOSELY)
         if (np.abs(point.error) > GROSS * point.scales).any():
             point = replace(point, far=GROSS)
         for _ in range(SETTLING):
@@ -304,8 +286,7 @@ class Shooting:
 
     def shift(self, theta: Array, substeps: int) -> Array:
         """Change of ``theta`` by a Gauss-Newton step if the outputs are computed with other ``substeps``."""
-        point = self.start(theta, self.first_states(theta), "all")
-        point = replace(point, scale=self._left(point.error), held=1.0)
+        point = self._rescaled(self.start(theta, self.first_states(theta), "all"))
         finer = self._at(replace(point, substeps=substeps), theta, point.x, "")
         moved = [
             self._step(self._behind(p) if self.windows.warm else self._normal(p), 0.0, theta)[0]
@@ -325,16 +306,14 @@ class Shooting:
 
         Both are over the errors' scales and times the root of the robust weights.
         """
-        point = self.start(theta, x, "all")
-        return self._eliminated(replace(point, scale=self._left(point.error), held=1.0))[:2]
+        return self._eliminated(self._rescaled(self.start(theta, x, "all")))[:2]
 
     def scaled_slopes(self, theta: Array) -> tuple[Array, Array, Array]:
         """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` from the best first states, these
         eliminated, by the root of their robust weights [output units]; and the scale of each output's errors
         ``(n_y,)``.
         """
-        point = self.start(theta, self.first_states(theta), "all")
-        point = replace(point, scale=self._left(point.error), held=1.0)
+        point = self._rescaled(self.start(theta, self.first_states(theta), "all"))
         slopes, error, *_ = self._eliminated(point)
         unit = point.scales
         return slopes * unit[:, None], error * unit, point.scale
@@ -356,25 +335,20 @@ class Shooting:
             by = by.reshape(n, error.shape[1], by.shape[-1])
         return replace(before, theta=theta, x=x, error=error, slopes=by)
 
+    def _rescaled(self, point: _Point) -> _Point:
+        """The point with the residuals' robust scales, and with the full weight of the initial states' guesses."""
+        return replace(point, scale=self._left(point.error), held=1.0)
+
     def _costs(self, point: _Point) -> Array:
         """Robust cost of each group of windows for its initial state, with the distance from the guess."""
-        c2, moved = OUTLIERS**2, self._moved(point) / np.sqrt(self.members)[:, None]
-        over = np.minimum(np.abs(point.error / point.scales), point.far)
-        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
-        return self._grouped((own * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
+        moved = self._moved(point) / np.sqrt(self.members)[:, None]
+        return self._grouped((point.robust * self.tell).sum(axis=1) + np.square(moved).sum(axis=1))
 
     def _cost(self, point: _Point) -> float:
-        """Cost of ``theta``: sum over all windows; with a warm-up, over the samples after it."""
-        if not self.windows.warm:
-            return float(self._costs(point).sum()) + self._pulled(point)
-        c2 = OUTLIERS**2
-        over = np.minimum(np.abs(point.error / point.scales), point.far)
-        own = 2 * c2 * (np.sqrt(1 + np.square(over) / c2) - 1)
-        return float((own * self.count).sum()) + self._pulled(point)
-
-    def _pulled(self, point: _Point) -> float:
-        """Cost of the parameters' distance from their nominal values."""
-        return float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
+        """Cost of ``theta``: sum over all windows; with a warm-up, over the samples after it; and the pull's cost."""
+        pulled = float(np.square(self.own.pull * (point.theta - self.own.nominal)).sum())
+        own = point.robust * self.count if self.windows.warm else self._costs(point)
+        return float(own.sum()) + pulled
 
     def _moved(self, point: _Point) -> Array:
         """Distance of the initial states from their guess, in sizes, times the root of its weight."""
@@ -394,10 +368,8 @@ class Shooting:
         left = [np.abs(own[..., j][self.seen[..., j]]) for j in range(len(self.spread))]
         robust = np.array([1.4826 * float(np.median(v)) if len(v) else 0.0 for v in left])
         whole = np.array([float(np.sqrt(np.mean(trim_outliers(v) ** 2))) if len(v) else 0.0 for v in left])
-        robust = np.maximum(
-            robust, COMMON * whole
-        )  # frequent errors are due to the prior; they are not outliers
-        return np.maximum(robust, 1e-9 * self.spread)
+        # frequent errors are due to the prior; they are not outliers
+        return np.maximum(np.maximum(robust, COMMON * whole), 1e-9 * self.spread)
 
     def _states(self, point: _Point, steps: int = COMPARED) -> _Point:
         """Initial states for a given ``theta``: Levenberg-Marquardt steps in each group of windows."""
@@ -444,10 +416,8 @@ class Shooting:
                     x = self._states(self._at(point, theta, x, "x")).x
                 trial = self._at(point, theta, x, "all")
                 new = self._cost(trial)
-                if not (
-                    new < cost or last or followed or self.windows.warm
-                ):  # initial states may not fit the new theta yet
-                    followed = True
+                if not (new < cost or last or followed or self.windows.warm):
+                    followed = True  # initial states may not fit the new theta yet
                     own = self._followed(point, trial)
                     if self._cost(own) < cost:
                         trial = self._at(point, theta, own.x, "all")
@@ -540,7 +510,7 @@ class Shooting:
         if not self.windows.warm:
             reduced = tt - (xt.swapaxes(1, 2) @ by_theta).sum(axis=0)
             slope = gt - (xt.swapaxes(1, 2) @ own[..., None])[..., 0].sum(axis=0)
-        step = _bounded(
+        step = bounded_step(
             reduced + damping * np.diag(np.maximum(np.diag(tt), 1e-30)), slope,
             self.own.lower[: len(theta)] - theta, self.own.upper[: len(theta)] - theta,
         )  # fmt: skip
@@ -556,7 +526,7 @@ class Shooting:
         return covariance(self.own, point.theta, slopes, error, falling, counted, taken, len(self.spread))
 
 
-def _bounded(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
+def bounded_step(matrix: Array, slope: Array, low: Array, high: Array) -> Array:
     """Step ``s`` ``(n,)`` that reduces ``s' matrix s / 2 + slope' s`` within ``low <= 0`` and ``high >= 0``.
 
     Of the components that would leave their bounds, the first one to reach its bound is fixed there, and the others are

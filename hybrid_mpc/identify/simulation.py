@@ -303,6 +303,12 @@ def rest_of(prior: Prior) -> tuple[Array, Array, Array]:
     return x, u, w if len(w) == len(prior.disturbances) else nearest[2]
 
 
+def measured_as(prior: Prior, y: Array) -> Array:
+    """Clip outputs ``(..., n_y)`` to the sensors' declared ranges."""
+    low, high = np.array([s.saturation or (-math.inf, math.inf) for s in prior.outputs]).T
+    return np.asarray(np.clip(y, low, high))
+
+
 def _middle(signal: Signal) -> float:
     both = 0.5 * (signal.lower + signal.upper)
     return both if math.isfinite(both) else min(max(0.0, signal.lower), signal.upper)

@@ -99,13 +99,6 @@ class Smoother:
                 smoothed[i] = self._with_states(t, z)
         return [smoothed[i] for i in range(len(trajectories))]
 
-    def innovations(self, trajectories: Sequence[Trajectory]) -> tuple[float, float, int]:
-        """Sum of squared innovations over their variances, sum of log determinants, and number of innovations.
-
-        The filter starts with a large covariance; the first samples, which reduce it, are not counted.
-        """
-        return _innovations([self], trajectories)[0]
-
     @property
     def _n_z(self) -> int:
         return len(self.prior.states) + len(self.prior.corrected)
@@ -185,35 +178,20 @@ class Smoother:
         known = np.minimum(IGNORANCE * np.array(self.sizes.x), ranges)
         return np.concatenate([np.broadcast_to(known, (*walk.shape[:-1], len(known))), settled], axis=-1)
 
-    def prediction_errors(self, trajectories: Sequence[Trajectory], p: Array) -> tuple[Array, list[Array]]:
-        """One-step prediction errors of the filter for several sets of parameters ``(m, n_p)``.
-
-        Returns:
-            Errors of all trajectories, joined, over the standard deviations of the first set, ``(m, N)``; and the
-            unscaled errors of the first set by trajectory, ``(n, n_y)``.
-        """
-        every: list[Array] = []
+    def prediction_errors(self, trajectories: Sequence[Trajectory]) -> list[Array]:
+        """One-step prediction errors ``(n, n_y)`` of the filter for each trajectory; NaN where nothing is measured."""
         own: dict[int, Array] = {}
         for group in _together(trajectories):
-            runs, m, b = _Runs.of(self, list(group.values())), len(p), len(group)
-            found = self._filtered(runs.times(m), p=np.repeat(p, b, axis=0))
-            e = found.e.reshape(m, b, *found.e.shape[1:])
-            seen = np.where(found.counted[:b], e[0], np.nan)
+            runs = _Runs.of(self, list(group.values()))
+            found = self._filtered(runs)
+            seen = np.where(found.counted, found.e, np.nan)
             own |= {i: v[:n] for i, v, n in zip(group, seen, runs.lengths, strict=True)}
-            scaled = _whitened(e, found.s[:b])[0]
-            every.append(np.asarray(scaled[:, runs.inside].reshape(m, -1), dtype=np.float64))
-        return np.concatenate(every, axis=1), [own[i] for i in range(len(trajectories))]
+        return [own[i] for i in range(len(trajectories))]
 
-    def _filtered(
-        self,
-        runs: _Runs,
-        p: Array | None = None,
-        levels: tuple[Array, Array] | None = None,
-    ) -> _Filtered:
+    def _filtered(self, runs: _Runs, levels: tuple[Array, Array] | None = None) -> _Filtered:
         """Run the filter.
 
-        Parameters are the prior's, or ``p`` ``(b, n_p)``. Noise and walk are the smoother's, or those of each run in
-        ``levels``, ``(b, n_y)`` and ``(b, n_d)``.
+        Noise and walk are the smoother's, or those of each run in ``levels``, ``(b, n_y)`` and ``(b, n_d)``.
         """
         b, n_z, n_x = len(runs.y), self._n_z, len(self.prior.states)
         sigma, walk = (np.broadcast_to(v, (b, np.shape(v)[-1])) for v in levels or (self.sigma, self.walk))
@@ -221,7 +199,7 @@ class Smoother:
         first = np.concatenate([runs.first, np.zeros((b, n_z - n_x))], axis=1)
         ahead = np.concatenate([first[:, None], spread[..., None] ** 2 * np.eye(n_z)], axis=1)
         signals = [np.where(runs.seen, runs.y, 0.0), runs.seen, runs.censored, runs.u, runs.w]
-        values = np.broadcast_to(self.prior.p, (b, len(self.prior.parameters))) if p is None else p
+        values = np.broadcast_to(self.prior.p, (b, len(self.prior.parameters)))
         noise = np.concatenate([np.zeros((b, n_x)), np.square(walk)], axis=1)
         _, others = over_time(
             self._period,
@@ -365,7 +343,11 @@ def _whitened(e: Array, s: Array) -> tuple[Array, Array]:
 def _innovations(
     smoothers: Sequence[Smoother], trajectories: Sequence[Trajectory]
 ) -> list[tuple[float, float, int]]:
-    """:meth:`Smoother.innovations` of smoothers that differ only in noise and walk."""
+    """Sums of squared innovations over their variances and of log determinants, and number of innovations.
+
+    Of each of several smoothers that differ only in noise and walk. The filter starts with a large covariance; the
+    first samples, which reduce it, are not counted.
+    """
     one, m = smoothers[0], len(smoothers)
     squares, logs, count = np.zeros(m), np.zeros(m), np.zeros(m)
     for group in _together(trajectories):
@@ -426,12 +408,9 @@ def fit_smoother(
         best, width = float(ratios[np.argmin(costs(ratios))]), 2 * width / (AT_ONCE - 1)
     ((squares, _, count),) = _innovations([at(best)], sample)
     sizes = at(best).sizes
-    spreads = np.array(sizes.y) / np.array(
-        sizes.noise
-    )  # a sensor's noise is at most the spread of its output
-    return at(
-        best, float(np.clip(math.sqrt(squares / max(count, 1)), QUIETEST * spreads.max(), spreads.max()))
-    )
+    # a sensor's noise is at most the spread of its output
+    most = float(np.max(np.array(sizes.y) / np.array(sizes.noise)))
+    return at(best, float(np.clip(math.sqrt(squares / max(count, 1)), QUIETEST * most, most)))
 
 
 def rough_smoother(
@@ -467,9 +446,8 @@ def sizes_of(prior: Prior, trajectories: Sequence[Trajectory], dt: float, time_u
     spread = np.where(spread > 0, spread, 1.0)
     noise = np.maximum(_noise(trajectories), QUIETEST * spread)
     seen = seen_by(prior, dt, time_unit) / spread[:, None, None]
-    size = np.sqrt(
-        np.mean(np.sum(np.square(seen), axis=0), axis=0)
-    )  # effect of one unit of each state on the outputs, in spreads
+    # effect of one unit of each state on the outputs, in spreads
+    size = np.sqrt(np.mean(np.sum(np.square(seen), axis=0), axis=0))
     ranges = np.array([s.upper - s.lower for s in prior.states])
     x = np.minimum(1.0 / np.maximum(size, 1e-300), np.where(np.isfinite(ranges), ranges, math.inf))
     unknown = ~np.isfinite(x) | (x > 1e200)

@@ -123,10 +123,11 @@ class PriorStep(Step):
     def free_run(self, x: Tensor, h: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """States of free runs, all runs in one call of CasADi; not differentiable."""
         runs, periods = x.shape[:-1].numel(), len(u)
+        # the last input is repeated
         u_all, w_all = (
             torch.cat([z, z[-1:]]).reshape(periods + 1, runs, z.shape[-1]).swapaxes(0, 1).numpy()
             for z in (u, w)
-        )  # the last input is repeated
+        )
         simulation = Simulation(self.prior.equations.xdot, self.dt)
         states = simulation.values(x.reshape(runs, -1).numpy(), u_all, w_all, self.p.numpy(), self.substeps)
         return torch.tensor(states).swapaxes(0, 1).reshape(periods + 1, *x.shape)
@@ -196,6 +197,8 @@ class RecurrentStep(Step):
     scale_centre_w: Tensor
     scale_xdot: Tensor
     own_shift: Tensor
+    into: Tensor
+    own_rows: Tensor
 
     def __init__(
         self,
@@ -215,9 +218,15 @@ class RecurrentStep(Step):
         own = shift if isinstance(shift, Tensor) else torch.zeros(len(prior.parameters), dtype=torch.float64)
         self.register_buffer("own_shift", own, persistent=False)
         for name, values in vars(scaling).items():
-            if name == "substeps":
-                continue
-            self.register_buffer(f"scale_{name}", torch.tensor(values, dtype=torch.float64))
+            if name != "substeps":
+                self.register_buffer(f"scale_{name}", torch.tensor(values, dtype=torch.float64))
+        rows = torch.tensor(prior.corrected, dtype=torch.int64)
+        into = torch.zeros(len(prior.states), len(rows), dtype=torch.float64)
+        into[rows, torch.arange(len(rows))] = 1.0
+        self.register_buffer("into", into, persistent=False)  # matrix from corrections to rates
+        self.register_buffer("own_rows", 1.0 - into.sum(1), persistent=False)
+        at = rows.tolist()
+        self.corrected = slice(at[0], at[-1] + 1) if at == list(range(at[0], at[-1] + 1)) else rows
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
@@ -327,27 +336,6 @@ class HybridStep(RecurrentStep):
     """
 
     corrects_prior = True
-    into: Tensor
-    own_rows: Tensor
-
-    def __init__(
-        self,
-        prior: Prior,
-        network: nn.Module,
-        scaling: Scaling,
-        dt: float,
-        *,
-        use_prior: bool = True,
-        shift: Tensor | TrainedParameters | None = None,
-    ) -> None:
-        super().__init__(prior, network, scaling, dt, use_prior=use_prior, shift=shift)
-        rows = torch.tensor(prior.corrected, dtype=torch.int64)
-        into = torch.zeros(len(prior.states), len(rows), dtype=torch.float64)
-        into[rows, torch.arange(len(rows))] = 1.0
-        self.register_buffer("into", into, persistent=False)  # matrix from corrections to rates
-        self.register_buffer("own_rows", 1.0 - into.sum(1), persistent=False)
-        at = rows.tolist()
-        self.corrected = slice(at[0], at[-1] + 1) if at == list(range(at[0], at[-1] + 1)) else rows
 
     @classmethod
     def sizes(cls, prior: Prior, use_prior: bool) -> tuple[int, int]:
@@ -535,13 +523,6 @@ class TrainedParameters(nn.Module):
         """Difference from the prior's parameters, ``(networks, 1, n_p)``."""
         ways = torch.cat([self.ways[name] for name in self._spec], dim=1)
         return (ways @ self.spans).unsqueeze(1)
-
-    def values(self) -> dict[str, Tensor]:
-        """Values [their units] of each free parameter, ``(networks,)``."""
-        return {
-            name: start + (upper - lower) * self.ways[name][:, 0]
-            for name, (start, lower, upper) in self._spec.items()
-        }
 
     def project(self) -> None:
         """Clip the values to their bounds."""

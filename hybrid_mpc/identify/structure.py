@@ -491,11 +491,7 @@ def causes(
     for length in lengths:
         problem, short, few = (
             shooting(fit, known, sizes, min(own, length), most)
-            for own, most in (
-                (length, TRIALS),
-                (LENGTHS[1] * time_unit, TRIALS),
-                (time_unit, FEW),
-            )
+            for own, most in ((length, TRIALS), (LENGTHS[1] * time_unit, TRIALS), (time_unit, FEW))
         )
         if _tried(fit, problem, [_Start(-1, thetas[1])], 0)[0].error <= quiet(problem):
             continue
@@ -657,19 +653,17 @@ def _tried(
         held: True: factors are fixed. Default: False.
     """
     groups: dict[int, list[int]] = {}
-    for i, one in enumerate(
-        begun
-    ):  # grouped by sub-steps, so that a stiff start does not slow down the others
+    # grouped by sub-steps, so that a stiff start does not slow down the others
+    for i, one in enumerate(begun):
         substeps = fit.choosing([one.term]).most_substeps(one.theta[None])
         groups.setdefault(substeps.bit_length(), []).append(i)
     found = []
     for own in groups.values():
-        every = problem.several(
+        chosen, thetas = (
+            fit.choosing([begun[i].term for i in own], held),
             np.stack([begun[i].theta for i in own]),
-            lambda numbers, own=own: fit.choosing([begun[own[i]].term for i in numbers], held),  # type: ignore[misc]
-            [len(own)] * steps,
-            -1 if held else None,
         )
+        every = problem.several(chosen, thetas, steps, -1 if held else None)
         found += [replace(one, start=own[one.start]) for one in every]
     return found
 
@@ -784,7 +778,7 @@ def _signals(
         fit = _Lenient(make, dt)
         fit.points = visited(known)
         problem = shooting(fit, known, sizes, length, TRIALS)
-        found = problem.several(np.stack(starts), lambda numbers, own=fit: own, [len(starts)] * STEPS)  # type: ignore[misc]
+        found = problem.several(fit, np.stack(starts), STEPS)
         yield Cause(what, why, min(t.error for t in found) / before)
 
 

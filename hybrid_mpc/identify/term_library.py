@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,8 @@ def library(prior: Prior, points: Points, dt: float, length: float) -> tuple[Can
         dt: Model period [s].
         length: Length [s] of the free runs that evaluate models; the largest lag is a quarter of it.
     """
-    return tuple(_Library(prior, points, dt, length).candidates())
+    found = _Library(prior, points, dt, length).candidates()
+    return tuple(Candidate(one.name, (one,)) if isinstance(one, Term) else one for one in found)
 
 
 class _Library:
@@ -74,6 +76,7 @@ class _Library:
         rates = prior.equations.xdot(self.x.T, self.u.T, self.w.T, prior.p).full().T
         self.rates = np.sqrt(np.mean(np.square(rates), axis=0))
         self.changes = dt * self.rates
+        self.units = [f"{s.unit}/s" for s in prior.states]
         self.positions = {v: q for q, v in prior.kinematics}
         self.mechanical = isinstance(prior, MechanicalPrior)
         if isinstance(prior, MechanicalPrior):
@@ -84,9 +87,10 @@ class _Library:
             mass = mass.reshape(half, len(self.x), half).swapaxes(0, 1)
             forces = np.einsum("nij,nj->ni", mass, rates[:, half:])
             self.rates = np.concatenate([self.rates[:half], np.sqrt(np.mean(np.square(forces), axis=0))])
+            self.units[half:] = ["N" if s.unit.startswith("m") else "N m" for s in prior.states[half:]]
 
-    def candidates(self) -> Iterator[Candidate]:
-        """All candidates."""
+    def candidates(self) -> Iterator[Term | Candidate]:
+        """All candidates; a term alone is one of a single form."""
         exact = set(self.positions.values())
         for i, state in enumerate(self.prior.states):
             if i in self.positions:
@@ -101,42 +105,33 @@ class _Library:
             yield from self._output(i, signal)
 
     def _weight(
-        self, name: str, i: int, size: float, unit: str, *, positive: bool = False, words: str = ""
+        self, i: int, key: str, size: float, per: Sequence[str] = (), positive: bool = False, words: str = ""
     ) -> Parameter:
-        """Weight of a law of this size in the rate of state ``i``."""
+        """Weight of a law of this size and unit ``per`` in the rate of state ``i``, or in the force on its axis."""
         # bound of a term's weight: largest effect of the term, over the state's rate in the recordings
-        most = 3.0 * self.rates[i] / max(size, 1e-12)
-        return Parameter(name, 0.0, unit, 0.0 if positive else -most, most, words)
+        most, name = 3.0 * self.rates[i] / max(size, 1e-12), f"{key}_{self.prior.states[i].name}"
+        return Parameter(name, 0.0, over(self.units[i], *per), 0.0 if positive else -most, most, words)
 
-    def _axis(self, i: int, state: Signal) -> Iterator[Candidate]:
+    def _axis(self, i: int, state: Signal) -> Iterator[Term | Candidate]:
         own, q = state.name, self.positions[i]
         v, position = self.x[:, i], self.x[:, q]
         speed, turning = float(np.sqrt(np.mean(v**2))), self.prior.states[q].unit == "rad"
         if not speed > 0:
             return
         place: Place = "force" if self.mechanical else "rate"
-        force = "N" if state.unit.startswith("m") else "N m"
-        unit = force if self.mechanical else f"{state.unit}/s"
         width = min(WIDEST * speed, max(0.5 * self.changes[i], NARROWEST * speed))
-
-        def weight(
-            key: str, size: float, per: Sequence[str] = (), positive: bool = False, words: str = ""
-        ) -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, over(unit, *per), positive=positive, words=words)
-
+        weight = partial(self._weight, i)
         v_unit, q_unit = state.unit, state.unit.removesuffix("/s")
         at: dict[str, Any] = {"width": width, "place": place}
-        yield _one(laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at))
-        yield _one(
-            laws.asymmetric(own, weight("F_a", 1.0, words="dry friction forwards more than backwards"), **at)
+        yield laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at)
+        yield laws.asymmetric(
+            own, weight("F_a", 1.0, words="dry friction forwards more than backwards"), **at
         )
-        yield _one(laws.viscous(own, weight("d", speed, (v_unit,), True, "viscous friction"), place=place))
-        yield _one(
-            laws.viscous_by_direction(
-                own, weight("d_a", speed, (v_unit,), words="viscous friction by direction"), place=place
-            )
+        yield laws.viscous(own, weight("d", speed, (v_unit,), True, "viscous friction"), place=place)
+        yield laws.viscous_by_direction(
+            own, weight("d_a", speed, (v_unit,), words="viscous friction by direction"), place=place
         )
-        yield _one(laws.quadratic(own, weight("c", speed**2, (v_unit, v_unit), True, "drag"), place=place))
+        yield laws.quadratic(own, weight("c", speed**2, (v_unit, v_unit), True, "drag"), place=place)
         yield Candidate(
             f"Stribeck friction of {own}",
             tuple(
@@ -151,7 +146,7 @@ class _Library:
         )
         for k, load in enumerate(("driven", "resting", "both"), 1):
             mu = Parameter(f"mu_{k}_{own}", 0.0, "-", 0.0, 2.0, f"friction by {load} load")
-            yield _one(laws.loaded(own, mu, load=load, **at))
+            yield laws.loaded(own, mu, load=load, **at)
         centre, span = float(np.mean(position)), float(np.std(position)) or 1.0
         sizes: tuple[float, float] = (0.7, 0.7) if turning else (span, span**2)
         per: tuple[tuple[str, ...], ...] = ((), ()) if turning else ((q_unit,), (q_unit, q_unit))
@@ -160,19 +155,15 @@ class _Library:
             for k, size, p in zip((1, 2), sizes, per, strict=True)
         ]
         if turning or not self.prior.states[q].periodic:  # the term's sine is that of radians
-            yield _one(
-                laws.coulomb_by_position(
-                    own, *names, turning=turning, centre=0.0 if turning else centre, **at
-                )
+            yield laws.coulomb_by_position(
+                own, *names, turning=turning, centre=0.0 if turning else centre, **at
             )
-        yield _one(laws.offset(own, weight("F_0", 1.0, words="offset"), place=place))
+        yield laws.offset(own, weight("F_0", 1.0, words="offset"), place=place)
         if not self.mechanical:
             return
         if turning:
-            yield _one(
-                laws.gravity_error(
-                    own, weight("G_s", 0.7, words="gravity by sin q"), weight("G_c", 0.7, words="by cos q")
-                )
+            yield laws.gravity_error(
+                own, weight("G_s", 0.7, words="gravity by sin q"), weight("G_c", 0.7, words="by cos q")
             )
             yield Candidate(
                 f"cogging of {own}",
@@ -187,34 +178,26 @@ class _Library:
         if self.prior.states[q].periodic:
             return
         stiff = (q_unit,)
-        yield _one(laws.spring(own, weight("k", span, stiff, words="stiffness"), centre=centre))
+        yield laws.spring(own, weight("k", span, stiff, words="stiffness"), centre=centre)
         low, high = np.quantile(position, (0.02, 0.98))
         reach = 0.1 * (high - low)
-        yield _one(
-            laws.elastic_end(
-                own, weight("k_u", reach, stiff, True, "upper end"), edge=float(high - reach), upper=True
-            )
+        yield laws.elastic_end(
+            own, weight("k_u", reach, stiff, True, "upper end"), edge=float(high - reach), upper=True
         )
-        yield _one(
-            laws.elastic_end(
-                own, weight("k_l", reach, stiff, True, "lower end"), edge=float(low + reach), upper=False
-            )
+        yield laws.elastic_end(
+            own, weight("k_l", reach, stiff, True, "lower end"), edge=float(low + reach), upper=False
         )
 
-    def _process(self, i: int, state: Signal) -> Iterator[Candidate]:
-        own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
+    def _process(self, i: int, state: Signal) -> Iterator[Term | Candidate]:
+        own, values, weight = state.name, self.x[:, i], partial(self._weight, i)
         temperature = (parse_unit(state.unit) or (1.0, ()))[1] == (0, 0, 0, 0, 1, 0, 0)
-
-        def weight(key: str, size: float, per: Sequence[str] = (), words: str = "") -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, over(unit, *per), words=words)
-
-        yield _one(laws.offset(own, weight("r_0", 1.0, words="offset of the rate"), place="rate"))
+        yield laws.offset(own, weight("r_0", 1.0, words="offset of the rate"), place="rate")
         if state.lower < 0 and not (
             state.periodic or temperature
         ):  # such as a speed without a position, or a current
             size = float(np.sqrt(np.mean(values**2)))
-            dry = self._weight(f"F_c_{own}", i, 1.0, unit, positive=True, words="dry friction")
-            yield _one(laws.coulomb(own, dry, width=0.05 * size or 1.0, place="rate"))
+            dry = weight("F_c", 1.0, positive=True, words="dry friction")
+            yield laws.coulomb(own, dry, width=0.05 * size or 1.0, place="rate")
         if not state.periodic:
             yield from self._losses(i, state, temperature)
             yield self._storage(i, state)
@@ -223,30 +206,21 @@ class _Library:
             scale, centre = float(np.std(c)), float(np.mean(c))
             if scale > 0:
                 k = weight(f"k_{_short(s.name)}", scale, (s.unit,), words=f"of {s.name}")
-                yield _one(laws.coupling(own, k, source=s.name, centre=centre))
+                yield laws.coupling(own, k, source=s.name, centre=centre)
         everything = signals if state.periodic else [(state, values), *signals]
         for a, (one, c) in enumerate(everything):
             for two, d in everything[a:]:
                 size = float(np.std(c) * np.std(d))
                 if size > 0:
                     key = f"k_{_short(one.name)}_{_short(two.name)}"
-                    k = weight(
-                        key,
-                        size,
-                        (one.unit, two.unit),
-                        words=f"of {one.name} and {two.name}",
-                    )
+                    k = weight(key, size, (one.unit, two.unit), words=f"of {one.name} and {two.name}")
                     centres = float(np.mean(c)), float(np.mean(d))
-                    yield _one(laws.product(own, k, one=one.name, two=two.name, centres=centres))
+                    yield laws.product(own, k, one=one.name, two=two.name, centres=centres)
 
-    def _losses(self, i: int, state: Signal, temperature: bool) -> Iterator[Candidate]:
+    def _losses(self, i: int, state: Signal, temperature: bool) -> Iterator[Term | Candidate]:
         """Losses of a state: to its surroundings, by radiation, by overflow."""
-        own, values, unit = state.name, self.x[:, i], f"{state.unit}/s"
+        own, values, weight = state.name, self.x[:, i], partial(self._weight, i, positive=True)
         low, high = float(values.min()), float(values.max())
-
-        def weight(key: str, size: float, by: str, words: str) -> Parameter:
-            return self._weight(f"{key}_{own}", i, size, by, positive=True, words=words)
-
         forms = []
         references: list[tuple[str | float, Array]] = (
             [(0.0, np.zeros(len(values)))]
@@ -259,7 +233,7 @@ class _Library:
             for exponent, key in ((1.0, "a"), (0.5, "b"), (2.0, "c")):
                 if temperature and exponent == 0.5:
                     continue
-                k = weight(f"k_{number}{key}", far, "1/s", "loss")
+                k = weight(f"k_{number}{key}", far, (state.unit,), words="loss")
                 # the exponent is free: 1 to 1.33 for free convection, 0.5 for an outlet
                 n = Parameter(f"n_{number}{key}_{own}", exponent, "-", *EXPONENTS, "exponent of the loss")
                 forms.append(laws.loss(own, k, n, scale=far, reference=reference))
@@ -267,14 +241,8 @@ class _Library:
         if temperature:
             kelvin = 0.0 if state.unit == "K" else 273.15
             size = abs((np.mean(values) + kelvin) ** 4 - (low + kelvin) ** 4) / 1e8 or 1.0
-            yield _one(
-                laws.radiation(
-                    own,
-                    weight("e", float(size), f"{unit} 1e8/K^4", "radiation"),
-                    kelvin=kelvin,
-                    surroundings=low,
-                )
-            )
+            k = replace(weight("e", float(size), words="radiation"), unit=f"{state.unit}/s 1e8/K^4")
+            yield laws.radiation(own, k, kelvin=kelvin, surroundings=low)
         width = 0.02 * (high - low) or 1.0
         if state.lower < 0 or temperature:
             return
@@ -284,7 +252,7 @@ class _Library:
             tuple(
                 laws.overflow(
                     own,
-                    weight(f"s_{n}", high - edge, over(unit, state.unit), "overflow"),
+                    weight(f"s_{n}", high - edge, (state.unit,), words="overflow"),
                     Parameter(f"edge_{n}_{own}", edge, state.unit, 0.5 * (low + high), high, "edge"),
                     width=width,
                 )
@@ -311,21 +279,19 @@ class _Library:
             forms.append(laws.storage(state.name, k, tau, state=inner))
         return Candidate(f"second capacity of {state.name}", tuple(forms))
 
-    def _disturbance(self, i: int, signal: Signal) -> Iterator[Candidate]:
+    def _disturbance(self, i: int, signal: Signal) -> Iterator[Term | Candidate]:
         own, values = signal.name, self.w[:, i]
         spread, centre = float(np.std(values)), float(np.mean(values))
         most = Parameter(
             f"o_{own}", 0.0, signal.unit, -2 * spread or -1.0, 2 * spread or 1.0, "offset of the disturbance"
         )
-        yield _one(laws.disturbance_offset(own, most))
+        yield laws.disturbance_offset(own, most)
         if not spread > 1e-9 * max(abs(centre), 1e-300):
             return
         gain = Parameter(f"g_{own}", 0.0, "-", -2.0, 2.0, "relative error of the disturbance's gain")
-        yield _one(laws.disturbance_gain(own, gain, centre=centre))
+        yield laws.disturbance_gain(own, gain, centre=centre)
         acting = replace(signal, name=f"{own}_acting", saturation=None)
-        yield _one(
-            laws.disturbance_lag(own, self._time(f"tau_{own}", "lag of the disturbance"), state=acting)
-        )
+        yield laws.disturbance_lag(own, self._time(f"tau_{own}", "lag of the disturbance"), state=acting)
 
     def _time(self, name: str, words: str) -> Parameter:
         return Parameter(name, 2 * self.dt, "s", self.dt, max(0.25 * self.length, 4 * self.dt), words)
@@ -344,7 +310,7 @@ class _Library:
             if s.unit == unit and k != i and s.name not in {one.name for one in self.prior.inputs}:
                 yield s, c
 
-    def _input(self, i: int, signal: Signal) -> Iterator[Candidate]:
+    def _input(self, i: int, signal: Signal) -> Iterator[Term | Candidate]:
         own, values = signal.name, self.u[:, i]
         spread, centre = float(np.std(values)), float(np.mean(values))
         if not spread > 1e-9 * max(abs(centre), 1e-300):
@@ -354,16 +320,14 @@ class _Library:
             return Parameter(f"{key}_{own}", 0.0, unit, 0.0 if positive else -most, most, words)
 
         tau = self._time(f"tau_{own}", "lag of the input")
-        yield _one(laws.input_lag(own, tau, state=replace(signal, name=f"{own}_acting")))
+        yield laws.input_lag(own, tau, state=replace(signal, name=f"{own}_acting"))
         late = self._time(f"late_{own}", "delay of the input")
-        yield _one(laws.input_delay(own, late, state=replace(signal, name=f"{own}_late")))
-        yield _one(laws.input_gain(own, of("g", 0.9, words="relative error of the gain")))
-        yield _one(laws.input_offset(own, of("o", 2 * spread, signal.unit, "offset of the input")))
+        yield laws.input_delay(own, late, state=replace(signal, name=f"{own}_late"))
+        yield laws.input_gain(own, of("g", 0.9, words="relative error of the gain"))
+        yield laws.input_offset(own, of("o", 2 * spread, signal.unit, "offset of the input"))
         if (values < 0).any() and (values > 0).any():
-            yield _one(laws.gain_by_direction(own, of("g_a", 0.9, words="gain forwards more than backwards")))
-            yield _one(
-                laws.dead_zone(own, of("z", spread, signal.unit, "dead zone", True), width=0.05 * spread)
-            )
+            yield laws.gain_by_direction(own, of("g_a", 0.9, words="gain forwards more than backwards"))
+            yield laws.dead_zone(own, of("z", spread, signal.unit, "dead zone", True), width=0.05 * spread)
         size = float(np.abs(values).max())
         k = Parameter(
             f"sat_{own}",
@@ -373,15 +337,15 @@ class _Library:
             9.0 / size**2,
             "saturation of the input",
         )
-        yield _one(laws.saturation(own, k))
+        yield laws.saturation(own, k)
         middle, span = (centre if centre > 2 * spread else 0.0), 2 * spread
         # slope of the curve: 1 + 2 c |u - middle| / span
         farthest = max(abs(end - middle) for end in _ends(signal, values))
         least = -min(0.5, 0.5 * STEEP * span / farthest)
         bend = Parameter(f"g_c_{own}", 0.0, "-", least, 0.5, "bend of the input")
-        yield _one(laws.input_curve(own, bend, centre=middle, span=span))
+        yield laws.input_curve(own, bend, centre=middle, span=span)
 
-    def _output(self, i: int, signal: Signal) -> Iterator[Candidate]:
+    def _output(self, i: int, signal: Signal) -> Iterator[Term | Candidate]:
         y = self.prior.equations.output(self.x.T, self.u.T, self.w.T, self.prior.p).full()[i]
         own, spread = signal.name, float(np.std(y))
         if not spread > 0:
@@ -393,18 +357,14 @@ class _Library:
 
         tau = self._time(f"tau_{own}", "lag of the sensor")
         shown = Signal(f"{own}_shown", unit, signal.lower, signal.upper)
-        yield _one(laws.output_lag(own, tau, state=shown))
-        yield _one(laws.output_gain(own, of("s_g", 0.5, words="relative error of the sensor's gain")))
-        yield _one(laws.output_offset(own, of("s_o", 2 * spread, unit, "offset of the sensor")))
+        yield laws.output_lag(own, tau, state=shown)
+        yield laws.output_gain(own, of("s_g", 0.5, words="relative error of the sensor's gain"))
+        yield laws.output_offset(own, of("s_o", 2 * spread, unit, "offset of the sensor"))
         low, high = (float(v) for v in np.quantile(y, (0.0, 1.0)))
         # slope of the curve: 1 + bend (2 y - low - high)
         farthest = max(abs(2 * end - low - high) for end in _ends(signal, y))
         bend = of("s_b", STEEP / farthest, over("1", unit), "bend of the sensor")
-        yield _one(laws.output_curve(own, bend, lower=low, upper=high))
-
-
-def _one(term: Term) -> Candidate:
-    return Candidate(term.name, (term,))
+        yield laws.output_curve(own, bend, lower=low, upper=high)
 
 
 def _ends(signal: Signal, values: Array) -> tuple[float, float]:

@@ -17,34 +17,15 @@ from hybrid_mpc.machine.mechanical import MechanicalPrior
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter, Signal
 
-GROUPS: Mapping[str, Mapping[str, str]] = {
-    "Axes": {
-        "coulomb": "dry friction", "asymmetric": "more dry friction forwards than backwards",
-        "viscous": "viscous friction", "viscous_by_direction": "more viscous friction forwards than backwards",
-        "quadratic": "drag, as in air", "stribeck": "more dry friction near rest",
-        "loaded": "dry friction by load of gear or bearing", "coulomb_by_position": "dry friction by position",
-        "offset": "constant force or rate", "gravity_error": "weight, its lever arm or angle",
-        "cogging": "force periodic in the position", "spring": "spring, cable, hose",
-        "elastic_end": "elastic stop",
-    },
-    "Processes": {
-        "loss": "loss to the surroundings", "storage": "second capacity, as of a wall", "radiation": "heat radiation",
-        "overflow": "overflow above an edge", "coupling": "effect of another signal",
-        "product": "effect of two signals together",
-    },
-    "Inputs": {
-        "input_gain": "gain", "input_offset": "offset", "input_curve": "curved characteristic",
-        "saturation": "saturation", "input_lag": "lag of the actuator", "input_delay": "delay",
-        "gain_by_direction": "gain by sign", "dead_zone": "no effect of small inputs",
-    },
-    "Measured disturbances": {
-        "disturbance_gain": "gain", "disturbance_offset": "offset of the sensor", "disturbance_lag": "lag",
-    },
-    "Sensors": {
-        "output_gain": "gain", "output_offset": "offset", "output_curve": "curved characteristic", "output_lag": "lag",
-    },
-}  # fmt: skip
-"""Effects of the laws, by the kind of signal ``of``."""
+GROUPS: Mapping[str, str] = {
+    "Axes": "coulomb asymmetric viscous viscous_by_direction quadratic stribeck loaded coulomb_by_position offset "
+    "gravity_error cogging spring elastic_end",
+    "Processes": "loss storage radiation overflow coupling product",
+    "Inputs": "input_gain input_offset input_curve saturation input_lag input_delay gain_by_direction dead_zone",
+    "Measured disturbances": "disturbance_gain disturbance_offset disturbance_lag",
+    "Sensors": "output_gain output_offset output_curve output_lag",
+}
+"""The laws by the kind of signal ``of``."""
 REMARKS: Mapping[str, str] = {
     "Axes": "`of` is the speed `v`, `q` its position. Units are those of a turning axis. For a sliding axis, read N"
     " for N m, and m for rad.\n\n- A potential `V` acts as the force `-dV/dq`. It needs a `MechanicalPrior`.\n- `load`"
@@ -124,7 +105,8 @@ def document() -> str:
         parts.append(
             f"## {title}\n\n{REMARKS[title]}\n\n| call | effect | equation | units |\n| --- | --- | --- | --- |"
         )
-        for law, effect in laws.items():
+        for law in laws.split():
+            effect = terms.EXPLANATIONS[law].removesuffix(".")
             cells = [f"`{call(law)}`", effect, equation(law), units[law]]
             parts.append(f"| {' | '.join(cells)} |")
         parts.append("")

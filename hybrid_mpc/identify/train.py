@@ -456,9 +456,8 @@ class TrainingRun:
 def _stack(prior: Prior, s: TrainingSettings, form: type[RecurrentStep]) -> StackedGRU:
     """Create the untrained stack of a training."""
     n_in, n_out = form.sizes(prior, s.use_prior)
-    zero_head = (
-        s.use_prior and form.corrects_prior
-    )  # a model that corrects the prior starts with zero correction
+    # a model that corrects the prior starts with zero correction
+    zero_head = s.use_prior and form.corrects_prior
     return StackedGRU(s.networks, n_in, s.hidden, n_out, seed=s.seed, zero_head=zero_head)
 
 

@@ -122,12 +122,7 @@ class Varying:
 
 
 def find_varying(
-    make: Callable[..., Prior],
-    fit: PriorFit,
-    recordings: Sequence[Trajectory],
-    *,
-    dt: float,
-    length: float,
+    make: Callable[..., Prior], fit: PriorFit, recordings: Sequence[Trajectory], *, dt: float, length: float
 ) -> Varying:
     """Find the parameters that differ between recordings, with the standard deviations of their differences.
 

@@ -139,13 +139,10 @@ class OutputWindows:
 
     def times(self, n: int) -> OutputWindows:
         """Repeat the windows ``n`` times, one behind the other."""
-        y, u, w, x, censored, known = (
-            np.concatenate([v] * n) for v in (self.y, self.u, self.w, self.x, self.censored, self.known)
-        )
+        keys = ("y", "u", "w", "x", "censored", "known")
+        every: dict[str, Any] = {key: np.concatenate([getattr(self, key)] * n) for key in keys}
         group = np.concatenate([self.group + i * (self.group.max() + 1) for i in range(n)])
-        return OutputWindows(
-            y=y, u=u, w=w, x=x, censored=censored, lead=self.lead, known=known, group=group, warm=self.warm
-        )
+        return replace(self, **every, group=group)
 
 
 def cut_outputs(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
@@ -20,15 +20,13 @@ import casadi as ca
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.machine import term_units
 from hybrid_mpc.machine.mechanical import MechanicalPrior
-from hybrid_mpc.machine.prior import Balance, OperatingPoint, Prior, named
+from hybrid_mpc.machine.prior import POINT, Balance, OperatingPoint, Prior, named
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Line, Name
 
 Place: TypeAlias = Literal["force", "potential", "rate", "input", "disturbance", "output"]
 PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "disturbance", "output")
-REPLACED: tuple[Place, ...] = ("input", "disturbance", "output")
-"""Places whose signal a term replaces."""
 Option: TypeAlias = Signal | tuple[float, ...] | bool | float | str
 
 
@@ -84,23 +82,32 @@ class At(NamedTuple):
         x: States of the prior, by name.
         u: Inputs that act, by name.
         w: Measured disturbances, by name.
+        p: Parameters of the prior, by name.
         own: The signal that the term changes: the state whose rate or force it adds to, the input or output itself.
         position: The position whose speed :attr:`own` is; None where there is none.
         driven: Force or rate by what the inputs do [unit of the force or rate], less what they do at rest.
         resting: Force or rate of the machine at rest where it is, as that of gravity or a spring.
         state: The term's own state; None where it has none.
-        p: Parameters of the prior, by name.
     """
 
     x: Any
     u: Any
     w: Any
-    own: Any
-    position: Any
-    driven: Any
-    resting: Any
-    state: Any
     p: Any
+    own: Any
+    position: Any = None
+    driven: Any = 0.0
+    resting: Any = 0.0
+    state: Any = None
+
+    @classmethod
+    def of(cls, prior: Prior, point: Sequence[Any], own: Any, **more: Any) -> At:
+        """Arguments of a law at the columns ``x, u, w, p`` of a prior."""
+        x, u, w, p = (
+            named(prior.names_of(key), ca.vertsplit(v) if v.numel() else [])
+            for key, v in zip(POINT, point, strict=True)
+        )
+        return cls(x, u, w, p, own, **more)
 
 
 @dataclass(frozen=True)
@@ -297,24 +304,10 @@ def _expressions(
     states = {term: next(own_x) for term in terms if term.state is not None}
     given = {term: named(term.names, [next(own_p) for _ in term.parameters]) for term in terms}
     x_base, extra = x[:n_x], dict[Term, Any]()
-    parts = {"x": x_base, "u": u, "w": w}
 
-    def at(own: Any, term: Term, position: Any = None, driven: Any = 0.0, resting: Any = 0.0) -> At:
-        x_named, u_named, w_named = (named(prior.names_of(k), ca.vertsplit(v)) for k, v in parts.items())
-        p_named = named(prior.names_of("p"), ca.vertsplit(of_base))
-        return At(
-            x=x_named,
-            u=u_named,
-            w=w_named,
-            own=own,
-            position=position,
-            driven=driven,
-            resting=resting,
-            state=states.get(term),
-            p=p_named,
-        )
-
-    def applied(term: Term, point: At) -> Any:
+    def applied(term: Term, own: Any, **more: Any) -> Any:
+        """What a law gives; the rate of its own state is kept."""
+        point = At.of(prior, (x_base, u, w, of_base), own, state=states.get(term), **more)
         value = term.law(point, given[term])
         if term.state is not None:
             value, extra[term] = value
@@ -327,9 +320,8 @@ def _expressions(
     for term in terms:
         if term.place in replaced:
             acting = replaced[term.place]
-            acting[term.of] = applied(term, at(acting[term.of], term))
-    parts["u"] = u = ca.vertcat(*replaced["input"].values())
-    parts["w"] = w = ca.vertcat(*replaced["disturbance"].values())
+            acting[term.of] = applied(term, acting[term.of])
+    u, w = (ca.vertcat(*replaced[place].values()) for place in ("input", "disturbance"))
     equations = prior.equations
     rates = equations.xdot(x_base, u, w, of_base)
     added, lost, stored = ca.SX.zeros(n_x), ca.SX.zeros(n_x), ca.SX(0)
@@ -341,7 +333,8 @@ def _expressions(
         i = names.index(term.of)
         q = positions.get(term.of)
         driven, resting = _forces(base, x_base, u, w, of_base, term, i)
-        value = ca.SX(applied(term, at(x_base[i], term, None if q is None else x_base[q], driven, resting)))
+        position = None if q is None else x_base[q]
+        value = ca.SX(applied(term, x_base[i], position=position, driven=driven, resting=resting))
         if term.place == "potential":
             stored = stored + value
             assert q is not None
@@ -356,14 +349,11 @@ def _expressions(
         added = added + change
         if term.loss:
             lost = lost + change
-    outputs = dict(
-        zip(
-            (s.name for s in base.outputs), ca.vertsplit(equations.output(x_base, u, w, of_base)), strict=True
-        )
-    )
+    shown = ca.vertsplit(equations.output(x_base, u, w, of_base))
+    outputs = dict(zip((s.name for s in base.outputs), shown, strict=True))
     for term in terms:
         if term.place == "output":
-            outputs[term.of] = applied(term, at(outputs[term.of], term))
+            outputs[term.of] = applied(term, outputs[term.of])
     balances = []
     for b in equations.balances:
         storage = b.storage(x_base, of_base)
@@ -376,21 +366,10 @@ def _expressions(
             + slope.T @ (added - lost)
             + ca.gradient(held, x_base).T @ (rates + added)
         )
-        balances.append(
-            Balance(
-                b.name,
-                storage + held,
-                supply,
-                b.loss(x_base, u, w, of_base) - slope.T @ lost,
-                b.unit,
-                b.rate_unit,
-            )
-        )
-    return (
-        ca.vertcat(rates + added, *(extra[term] for term in states)),
-        tuple(outputs.values()),
-        tuple(balances),
-    )
+        loss = b.loss(x_base, u, w, of_base) - slope.T @ lost
+        balances.append(Balance(b.name, storage + held, supply, loss, b.unit, b.rate_unit))
+    xdot = ca.vertcat(rates + added, *(extra[term] for term in states))
+    return xdot, tuple(outputs.values()), tuple(balances)
 
 
 def _forces(
@@ -436,13 +415,18 @@ def _operating_point(base: type[Prior], terms: tuple[Term, ...]) -> OperatingPoi
     return OperatingPoint((*point.x, *more), point.u, point.w)
 
 
+def signals_at(base: type[Prior], place: str) -> tuple[Signal, ...]:
+    """The signals among which a term of a place has its own."""
+    found = {"input": base.inputs, "disturbance": base.disturbances, "output": base.outputs}
+    return found.get(place, base.states)
+
+
 def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
     problems, prior = [], base()
-    signals = {"input": base.inputs, "disturbance": base.disturbances, "output": base.outputs}
     moving = {base.states[v].name for _, v in prior.kinematics}
     for term in terms:
         where = f"term {term.name!r} for {base.__name__}"
-        names = [s.name for s in signals.get(term.place, base.states)]
+        names = [s.name for s in signals_at(base, term.place)]
         if term.of not in names:
             problems.append(
                 f"{where}: there is no {term.of!r}; choose of {', '.join(names)}. [HM-MACHINE-034]"
@@ -481,9 +465,8 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
     inputs: list[tuple[Any, str]] = [
         (v, s.unit) for key in groups for v, s in zip(symbols[key], groups[key], strict=True)
     ]
-    x, u, w, p = (named(prior.names_of(key), symbols[key]) for key in ("x", "u", "w", "p"))
     kind: str = {"input": "u", "disturbance": "w"}.get(term.place, "x")
-    signals = base.outputs if term.place == "output" else groups[kind]
+    signals = signals_at(base, term.place)
     k = [s.name for s in signals].index(term.of)
     unit, position = signals[k].unit, None
     wanted, power = term_units.of(unit), None
@@ -505,7 +488,9 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
     state = None if term.state is None else ca.SX.sym(term.state.name)
     if term.state is not None:
         inputs.append((state, term.state.unit))
-    point = At(x=x, u=u, w=w, own=own, position=position, driven=driven, resting=resting, state=state, p=p)
+    columns = [ca.vertcat(*symbols[key]) for key in POINT]
+    more = {"position": position, "driven": driven, "resting": resting, "state": state}
+    point = At.of(prior, columns, own, **more)
     value = _uneven(term).law(point, named(term.names, given))
     parts = [(value, wanted)]
     if term.state is not None:
@@ -541,8 +526,8 @@ def code_of(value: Option | Parameter) -> str:
         >>> code_of(Parameter("d", 0.0, "N s/m", 0.0, math.inf)), code_of(Signal("s", "N"))
         ("Parameter('d', 0.0, 'N s/m', 0.0, float('inf'))", "Signal('s', 'N')")
     """
-    if isinstance(value, float) and not math.isfinite(value):
-        return f"float('{value}')"
+    if isinstance(value, float):  # also numpy's, whose repr names numpy
+        return repr(float(value)) if math.isfinite(value) else f"float('{value}')"
     if isinstance(value, tuple):
         return f"({''.join(f'{code_of(one)}, ' for one in value).rstrip()})"
     if isinstance(value, Parameter):
@@ -567,18 +552,8 @@ def _added(
     if state is not None:
         options["state"] = state
     made = Made(maker, of, parameters, {**options, **({"place": place} if by_rate else {})})
-    return Term(
-        name=f"{title} of {of}",
-        place=place,
-        of=of,
-        parameters=parameters,
-        law=law,
-        text=text,
-        loss=loss,
-        state=state,
-        explanation=EXPLANATIONS[maker],
-        made=made,
-    )
+    name = f"{title} of {of}"
+    return Term(name, place, of, parameters, law, text, loss, state, EXPLANATIONS[maker], made)
 
 
 # Friction: against the motion of one axis.
@@ -596,16 +571,9 @@ def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") 
         place: ``"rate"`` for a prior that is not mechanical.
     """
     return _added(
-        "coulomb",
-        "Coulomb friction",
-        place,
-        of,
-        (level,),
-        lambda at, p: -p[0] * _sign(at.own, width),
-        f"-{level.name} sign({of})",
-        loss=True,
-        width=width,
-    )
+        "coulomb", "Coulomb friction", place, of, (level,), lambda at, p: -p[0] * _sign(at.own, width),
+        f"-{level.name} sign({of})", loss=True, width=width,
+    )  # fmt: skip
 
 
 def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force") -> Term:
@@ -626,15 +594,9 @@ def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force"
 def viscous(of: str, d: Parameter, *, place: Place = "force") -> Term:
     """Viscous friction ``-d v``."""
     return _added(
-        "viscous",
-        "viscous friction",
-        place,
-        of,
-        (d,),
-        lambda at, p: -p[0] * at.own,
-        f"-{d.name} {of}",
+        "viscous", "viscous friction", place, of, (d,), lambda at, p: -p[0] * at.own, f"-{d.name} {of}",
         loss=True,
-    )
+    )  # fmt: skip
 
 
 def viscous_by_direction(of: str, a: Parameter, *, place: Place = "force") -> Term:
@@ -886,14 +848,9 @@ def input_gain(of: str, g: Parameter) -> Term:
 def input_offset(of: str, value: Parameter) -> Term:
     """``u + offset``."""
     return _added(
-        "input_offset",
-        "input offset",
-        "input",
-        of,
-        (value,),
-        lambda at, p: at.own + p[0],
+        "input_offset", "input offset", "input", of, (value,), lambda at, p: at.own + p[0],
         f"{of} + {value.name}",
-    )
+    )  # fmt: skip
 
 
 def gain_by_direction(of: str, b: Parameter) -> Term:
@@ -996,27 +953,17 @@ def disturbance_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
 def output_gain(of: str, g: Parameter) -> Term:
     """A sensor of another gain: ``(1 + g) y``."""
     return _added(
-        "output_gain",
-        "sensor gain",
-        "output",
-        of,
-        (g,),
-        lambda at, p: (1.0 + p[0]) * at.own,
+        "output_gain", "sensor gain", "output", of, (g,), lambda at, p: (1.0 + p[0]) * at.own,
         f"(1 + {g.name}) {of}",
-    )
+    )  # fmt: skip
 
 
 def output_offset(of: str, value: Parameter) -> Term:
     """A sensor with an offset: ``y + offset``."""
     return _added(
-        "output_offset",
-        "sensor offset",
-        "output",
-        of,
-        (value,),
-        lambda at, p: at.own + p[0],
+        "output_offset", "sensor offset", "output", of, (value,), lambda at, p: at.own + p[0],
         f"{of} + {value.name}",
-    )
+    )  # fmt: skip
 
 
 def output_curve(of: str, bend: Parameter, *, lower: float, upper: float) -> Term:

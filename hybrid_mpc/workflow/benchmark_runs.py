@@ -16,12 +16,12 @@ from hybrid_mpc.identify.delay import lost_samples, shifted
 from hybrid_mpc.identify.evaluate import (
     OutputErrors,
     evaluation_trajectories,
-    measured_as,
     model_states,
     output_errors,
 )
 from hybrid_mpc.identify.linear import LinearModel
 from hybrid_mpc.identify.prior_result import PriorFit
+from hybrid_mpc.identify.simulation import measured_as
 from hybrid_mpc.identify.step import PriorStep
 from hybrid_mpc.identify.train import Trained
 from hybrid_mpc.machine.prior import Prior

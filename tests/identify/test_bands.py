@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc import InputError
-from hybrid_mpc.identify.bands import RunParts, coverage, fit_bands, interval_score, variance_parts
+from hybrid_mpc.identify.bands import RunParts, coverage, fit_bands, interval_score, run_variance
 from hybrid_mpc.identify.fit import parameter_variance
 from hybrid_mpc.identify.simulation import Simulation
 
@@ -17,8 +16,8 @@ def growing(rng, runs, tails="normal"):
     t, spread = np.linspace(0, 20, N), np.array([1.0, 300.0])
     made = []
     for _ in range(runs):
-        networks = np.square(spread) * np.full((N, 2), 0.01)
-        parts = variance_parts(t, 1e-3 * spread, spread, networks, np.zeros((N, 2)))
+        networks = np.array([-0.1, 0.1])[:, None, None] * np.ones((N, 2)) * spread
+        parts = run_variance(networks, np.zeros((N, 2)), t, 1e-3 * spread, spread)
         sigma = np.sqrt(0.02 + 0.3 * t / 20)[:, None] * spread * rng.lognormal(0.0, 0.3)
         noise = rng.standard_t(3, (N, 2)) if tails == "heavy" else rng.standard_normal((N, 2))
         made.append(RunParts(sigma * noise, parts))
@@ -94,17 +93,6 @@ def test_the_interval_score_is_that_of_its_definition():
     half = bands.half_width(np.ones((1, 1, 1)))[0, 0]
     run = RunParts(np.array([[0.0], [half + 0.5]]), np.ones((2, 1, 1)))
     assert interval_score(run, bands) == pytest.approx([2 * half + 0.5 * (2 / 0.1) * 0.5])
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0, 1.5])
-def test_a_share_that_is_none_is_refused(share):
-    with pytest.raises(InputError, match="HM-IDENTIFY-002"):
-        fit_bands([RunParts(np.ones((10, 1)), np.ones((10, 1, 1)))], share)
-
-
-def test_without_runs_there_is_no_band():
-    with pytest.raises(InputError, match="HM-IDENTIFY-001"):
-        fit_bands([])
 
 
 def test_the_variance_by_the_parameters_is_that_of_drawn_ones():

@@ -99,11 +99,6 @@ def test_the_user_overrules():
         recommend(errors, deploy="rnn")
 
 
-def test_without_runs_nothing_is_chosen():
-    with pytest.raises(InputError, match="HM-IDENTIFY-004"):
-        recommend({"phy": [], "pgrnn": []})
-
-
 def test_one_block_tells_nothing_of_its_scatter():
     choice = recommend({"phy": [np.ones(5)], "pgrnn": [0.1 * np.ones(5)]}, samples=5)
     assert choice.blocks == 1
@@ -166,15 +161,6 @@ def test_of_two_sure_hybrids_the_one_of_the_lower_ratio_is_taken():
     assert found["pgrnn"].error > found["mopgrnn"].error
     assert found["pgrnn"].ratio < found["mopgrnn"].ratio
     assert choice.recommended == choice.hybrid == "pgrnn"
-
-
-def test_many_blocks_of_two_days_are_two_pieces_of_evidence():
-    """Better on one day and hardly better on the other: another day may be either, however long the recordings are."""
-    prior = runs(np.random.default_rng(7), n=8)
-    hybrid = [(0.2 if i < 4 else 0.95) * own for i, own in enumerate(prior)]
-    errors = {"phy": prior, "pgrnn": hybrid}
-    assert recommend(errors).recommended == "pgrnn"
-    assert recommend(errors, recordings=["monday"] * 4 + ["tuesday"] * 4).recommended == "phy"
 
 
 def test_two_recordings_give_no_bound():
@@ -300,5 +286,3 @@ def test_a_rule_asks_for_more_evidence_for_fewer_recordings_and_for_other_shares
         shrunk=lambda name, share: asked.append(share) or errors[name],
     )  # fmt: skip
     assert asked == [0.3]
-    with pytest.raises(InputError, match="HM-RECORDS-007"):
-        ChoiceRule(confidence=1.0)

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from simulated_pendulum import DT, TRUTH, Pendulum
 
-from hybrid_mpc import FirstStates, InputError, Trajectory, fit_prior
+from hybrid_mpc import FirstStates, Trajectory, fit_prior
 from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.shooting import OUTLIERS, Shooting
 from hybrid_mpc.identify.simulation import Simulation
@@ -158,22 +158,3 @@ def test_only_a_recordings_own_first_sample_is_known(runs):
     shared = cut_outputs(guessed, 20, 0, 8, Pendulum.states, Pendulum.outputs, FirstStates("shared"))
     assert shared.group.tolist() == [0] * RUNS + [1, 2, 3, 4]
     assert shared.times(2).group.tolist() == [*shared.group, *(shared.group + 5)]
-
-
-@pytest.mark.parametrize(("options", "words"), [
-    ({"kind": "guessed"}, r"free, known.*HM-IDENTIFY-066"),
-    ({"kind": "known"}, "HM-IDENTIFY-067"),
-    ({"kind": "free", "values": {"phi": 0.0}}, "HM-IDENTIFY-067"),
-    ({"kind": "known", "values": {"phi": np.nan}}, "finite"),
-    ({"kind": "warm_up"}, "HM-IDENTIFY-069"),
-    ({"kind": "shared", "seconds": 1.0}, "HM-IDENTIFY-069"),
-])  # fmt: skip
-def test_what_does_not_belong_to_a_kind_is_refused(options, words):
-    with pytest.raises(InputError, match=words):
-        FirstStates(**options)
-
-
-def test_what_does_not_fit_to_the_prior_is_refused(runs):
-    first = FirstStates("known", {"speed": 0.0})
-    with pytest.raises(InputError, match="HM-IDENTIFY-072"):
-        fit_prior(Pendulum, runs, runs, dt=DT, first_states=first, largest_delay=0.1)

@@ -293,13 +293,6 @@ def test_many_windows_are_each_its_own_free_run(fit):
 # what is refused, what is doubtful
 
 
-def edited(role, change):
-    train, valid = recordings(system())
-    parts = {"train": train, "valid": valid}
-    parts[role] = change(parts[role])
-    return parts["train"], parts["valid"]
-
-
 def constant(array, column):
     array = array.copy()
     array[:, column] = 4.0
@@ -312,72 +305,56 @@ def nan_at(array):
     return array
 
 
+BOTH, SUBSPACE = (fit_arx, fit_subspace), (fit_subspace,)
+SHORT = {"train": lambda r: [run(system(), 8, 0, noise=0.3)]}
 REFUSED = {
-    "no training": ("train", lambda r: [], r"training.*HM-IDENTIFY-029"),
-    "no validation": ("valid", lambda r: [], r"validation.*HM-IDENTIFY-029"),
-    "an input that rests": (
-        "train", lambda r: [replace(x, u=constant(x.u, 1)) for x in r], "HM-IDENTIFY-036",
-    ),
-    "an output that rests": (
-        "train", lambda r: [replace(x, y=constant(x.y, 0)) for x in r], "HM-IDENTIFY-035",
-    ),
+    "no training": (BOTH, {"train": lambda r: []}, {}, r"training.*029"),
+    "no validation": (BOTH, {"valid": lambda r: []}, {}, r"validation.*029"),
+    "an input that rests": (BOTH, {"train": lambda r: [replace(x, u=constant(x.u, 1)) for x in r]}, {}, "036"),
+    "an output that rests": (BOTH, {"train": lambda r: [replace(x, y=constant(x.y, 0)) for x in r]}, {}, "035"),
     "an output that is nowhere": (
-        "train", lambda r: [replace(x, y=np.full_like(x.y, np.nan)) for x in r], "HM-IDENTIFY-035",
+        BOTH, {"train": lambda r: [replace(x, y=np.full_like(x.y, np.nan)) for x in r]}, {}, "035",
     ),
-    "a column less": (
-        "valid", lambda r: [replace(r[0], u=r[0].u[:, :1])],
-        r"validation recording 1.*HM-IDENTIFY-031",
-    ),
-    "a vector": ("train", lambda r: [Run(r[0].y[:, 0], r[0].u)], r"\(300,\).*\(300, 2\).*HM-IDENTIFY-030"),
-    "different lengths": ("train", lambda r: [Run(r[0].y[:-1], r[0].u)], r"\(299, 2\).*\(300, 2\).*HM-IDENTIFY-030"),
-    "a missing input": ("train", lambda r: [replace(r[0], u=nan_at(r[0].u)), r[1]], "HM-IDENTIFY-032"),
-    "an infinite output": ("train", lambda r: [replace(r[0], y=1 / (r[0].y * 0 + [0, 1])), r[1]], "HM-IDENTIFY-033"),
-    "a short validation": ("valid", lambda r: [Run(r[0].y[:10], r[0].u[:10])], r"10.*10.*HM-IDENTIFY-034"),
+    "a column less": (BOTH, {"valid": lambda r: [replace(r[0], u=r[0].u[:, :1])]}, {}, r"validation recording 1.*031"),
+    "a vector": (BOTH, {"train": lambda r: [Run(r[0].y[:, 0], r[0].u)]}, {}, r"\(300,\).*\(300, 2\).*030"),
+    "different lengths": (BOTH, {"train": lambda r: [Run(r[0].y[:-1], r[0].u)]}, {}, r"\(299, 2\).*\(300, 2\).*030"),
+    "a missing input": (BOTH, {"train": lambda r: [replace(r[0], u=nan_at(r[0].u)), r[1]]}, {}, "032"),
+    "an infinite output": (BOTH, {"train": lambda r: [replace(r[0], y=1 / (r[0].y * 0 + [0, 1])), r[1]]}, {}, "033"),
+    "a short validation": (BOTH, {"valid": lambda r: [Run(r[0].y[:10], r[0].u[:10])]}, {}, r"10.*10.*034"),
     "a disturbance of another length": (
-        "train", lambda r: [Disturbed(r[0].y, r[0].u, np.zeros((5, 1)))], r"\(5, 1\).*300.*HM-IDENTIFY-026",
+        BOTH, {"train": lambda r: [Disturbed(r[0].y, r[0].u, np.zeros((5, 1)))]}, {}, r"\(5, 1\).*300.*026",
+    ),
+    "no warm-up": (BOTH, {}, {"warm": 0}, "028"),
+    "half a sample": (BOTH, {}, {"warm": 2.5}, r"2\.5.*028"),
+    "no period": (BOTH, {}, {"dt": 0.0}, r"0\.0.*027"),
+    "a period that is no number": (BOTH, {}, {"dt": float("nan")}, r"nan.*027"),
+    "no orders": (BOTH, {}, {"orders": []}, r"orders.*\[\].*037"),
+    "an order of zero": (BOTH, {}, {"orders": [2, 0]}, "037"),
+    "an unknown weighting": (SUBSPACE, {}, {"weighting": "moesp"}, r"'moesp'.*025"),
+    "a horizon of one": (SUBSPACE, {}, {"horizons": [1]}, "037"),
+    "more states than the data have": (SUBSPACE, {}, {"orders": [8]}, "039"),
+    "too short for any order": ((fit_arx,), SHORT, {}, "15 runs of 2 samples, one recording of 16; there are 7.*038"),
+    "too short for an order": (
+        (fit_arx,), SHORT, {"orders": [1, 4]}, "needs 51 runs of 5 samples, one recording of 55; there are 4.*038",
+    ),
+    "too short for any horizon": (SUBSPACE, SHORT, {}, "123 runs of 10 samples, one recording of 132; there.*038"),
+    "too many states for a horizon": (
+        SUBSPACE, SHORT, {"orders": [30], "horizons": [10]}, "horizon 10 is too short for 30 states of 2 outputs.*038",
     ),
 }  # fmt: skip
+"""Fits, changes of the recordings, options, and what the message holds."""
 
 
-@both
-@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize(
+    ("fit", "case"), [(fit, case) for case, (fits, *_) in REFUSED.items() for fit in fits]
+)
 @pytest.mark.filterwarnings("ignore:divide by zero")
 def test_what_cannot_be_used_is_refused(fit, case):
-    role, change, message = case
+    _, changes, options, message = REFUSED[case]
+    parts = dict(zip(("train", "valid"), recordings(system()), strict=True))
+    parts |= {role: change(parts[role]) for role, change in changes.items()}
     with pytest.raises(InputError, match=message):
-        fit(*edited(role, change), 0.1, warm=10)
-
-
-@both
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"warm": 0}, "HM-IDENTIFY-028"),
-        ({"warm": 2.5}, r"2\.5.*HM-IDENTIFY-028"),
-        ({"dt": 0.0}, r"0\.0.*HM-IDENTIFY-027"),
-        ({"dt": float("nan")}, r"nan.*HM-IDENTIFY-027"),
-        ({"orders": []}, r"orders.*\[\].*HM-IDENTIFY-037"),
-        ({"orders": [2, 0]}, "HM-IDENTIFY-037"),
-    ],
-)
-def test_numbers_without_sense_are_refused(fit, options, message):
-    with pytest.raises(InputError, match=message):
-        fit(*recordings(system()), **{"dt": 0.1, "warm": 10, **options})
-
-
-@pytest.mark.parametrize(
-    ("fit", "options", "message"),
-    [
-        (fit_arx, {}, "order 1 with delays up to 1 needs 15 runs of 2 samples, one recording of 16; there are 7"),
-        (fit_arx, {"orders": [1, 4]}, "order 4 .* needs 51 runs of 5 samples, one recording of 55; there are 4"),
-        (fit_subspace, {}, r"horizon 5 \(up to 8 states\) needs 123 runs of 10 samples, one recording of 132; there"),
-        (fit_subspace, {"orders": [30], "horizons": [10]}, "horizon 10 is too short for 30 states of 2 outputs"),
-    ],
-)  # fmt: skip
-def test_what_is_too_short_hears_how_long_it_must_be(fit, options, message):
-    train = run(system(), 8, 0, noise=0.3)
-    with pytest.raises(InputError, match=f"too short: .*{message}"):
-        fit([train], [run(system(), 100, 1)], 0.1, warm=10, **options)
+        fit(parts["train"], parts["valid"], **{"dt": 0.1, "warm": 10, **options})
 
 
 @pytest.mark.parametrize("fit", [fit_arx, fit_subspace])
@@ -390,34 +367,14 @@ def test_the_length_that_is_asked_for_is_enough(fit):
         fit([run(system(), needed - 1, 0, noise=0.3)], valid, **options)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"weighting": "moesp"}, r"'moesp'.*HM-IDENTIFY-025"),
-        ({"horizons": [1]}, "HM-IDENTIFY-037"),
-        ({"orders": [8]}, "HM-IDENTIFY-039"),  # the data have four, and no noise
-    ],
-)
-def test_options_of_a_subspace_model_that_cannot_be(options, message):
-    with pytest.raises(InputError, match=message):
-        fit_subspace(*recordings(system()), 0.1, warm=10, **options)
-
-
-@pytest.mark.parametrize(
-    ("y", "u", "message"),
-    [
-        ((5, 2), (20, 3), "HM-IDENTIFY-021"),
-        ((5, 1), (20, 2), "HM-IDENTIFY-021"),
-        ((4, 5, 2), (3, 20, 2), "HM-IDENTIFY-021"),
-        ((2,), (20, 2), "HM-IDENTIFY-021"),
-        ((21, 2), (20, 2), r"21.*20.*HM-IDENTIFY-022"),
-        ((0, 2), (20, 2), "HM-IDENTIFY-022"),
-    ],
-)
-def test_a_free_run_of_other_shapes_is_refused(y, u, message):
+def test_a_free_run_of_other_shapes_is_refused():
     model = fit_arx(*recordings(system()), 0.1, warm=10, orders=[2])
-    with pytest.raises(InputError, match=message):
-        model.free_run(np.zeros(y), np.zeros(u))
+    for y, u, message in (
+        ((5, 2), (20, 3), "021"), ((5, 1), (20, 2), "021"), ((4, 5, 2), (3, 20, 2), "021"), ((2,), (20, 2), "021"),
+        ((21, 2), (20, 2), r"21.*20.*022"), ((0, 2), (20, 2), "022"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            model.free_run(np.zeros(y), np.zeros(u))
     with pytest.raises(InputError, match="HM-IDENTIFY-023"):
         model.free_run(np.zeros((5, 2)), np.full((20, 2), np.nan))
     with pytest.raises(InputError, match=r"10.*HM-IDENTIFY-024"):
@@ -454,10 +411,3 @@ def test_a_disturbance_that_rests_is_doubtful():
         )
         assert off(response(model.state_space())[:, :2], response(control.ss(*system(), 0.1))) < EXACT
         assert np.abs(model.state_space().B[:, 2]).max() < EXACT
-
-
-# real machines
-
-
-def part(recording, start, end=None):
-    return Run(recording.y[start:end], recording.u[start:end])

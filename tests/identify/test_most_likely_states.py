@@ -135,10 +135,9 @@ def test_states_stay_within_bounds():
     assert problem().costs(own, found)[0] > problem().costs(own, free)[0]
 
 
-def test_equations_without_a_number_at_the_start_are_told():
-    own = stretch(1)
+def test_equations_without_a_number_at_the_start_are_refused():
     with pytest.raises(InputError, match="HM-IDENTIFY-020"):
-        problem().solve(own, [np.full((N, 3), np.nan)])
+        problem().solve(stretch(1), [np.full((N, 3), np.nan)])
 
 
 class Runaway(Prior):

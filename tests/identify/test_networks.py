@@ -34,15 +34,6 @@ def test_a_member_is_its_network_of_the_stack_and_torchs_own_layer(stack):
         torch.testing.assert_close(outs[:, i], member.head(torchs(S[:, i])[0]), rtol=0, atol=1e-13)
 
 
-def test_sequence_equals_steps(stack):
-    outs, h_last = stack.sequence(S, H)
-    h = H
-    for s, out in zip(S, outs, strict=True):
-        one, h = stack(s, h)
-        torch.testing.assert_close(out, one, rtol=0, atol=1e-13)  # rounding through 7 steps
-    torch.testing.assert_close(h_last, h, rtol=0, atol=1e-13)
-
-
 def test_networks_of_a_stack_learn_alone(stack):
     """The gradient of one network's output is zero for all the others' weights."""
     outs, _ = stack.sequence(S, stack.initial(5))
@@ -83,10 +74,3 @@ def test_the_derivative_written_by_hand_is_that_of_its_values():
     arguments = [torch.tensor(rng.uniform(-1, 1, shape)).requires_grad_() for shape in shapes]
     # central differences with steps of 1e-6: rounding of 1e-16 / 1e-6 and more through the steps
     assert torch.autograd.gradcheck(hidden_states, arguments, eps=1e-6, atol=1e-8)
-
-
-def test_a_stack_stays_on_its_device(stack):
-    """``meta`` computes nothing, but refuses a tensor made elsewhere."""
-    there = stack.to("meta")
-    outs, _ = there.sequence(S.to("meta"), there.initial(5))
-    assert outs.device.type == "meta"

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_pendulum import DT, Pendulum, record
 
-from hybrid_mpc import HybridStep, InputError, Prior, Scaling, Signal, n_features
+from hybrid_mpc import HybridStep, Prior, Scaling, Signal, n_features
 from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.networks import StackedGRU
 from hybrid_mpc.identify.objectives import (
@@ -180,20 +180,3 @@ def test_balances_stands_for_all_of_the_prior():
     assert list(objectives_of(Two(), ("error", "balances"))) == ["error", "volume", "mass"]
     assert list(objectives_of(Two(), ("mass", "output"))) == ["mass", "output"]
     assert list(objectives_of(Observed(), ("error", "balances"))) == ["error"]  # it has none
-
-
-@pytest.mark.parametrize(
-    ("prior", "names", "words"),
-    [
-        (
-            Tanks,
-            ("error", "energy"),
-            r"energy.*Tanks.*volume.*HM-IDENTIFY-040",
-        ),
-        (Observed, ("balances",), r"Observed.*HM-IDENTIFY-040"),
-        (Observed, ("position", "power"), r"position, power.*HM-IDENTIFY-040"),
-    ],
-)
-def test_objectives_that_are_none_are_refused_with_what_there_is(prior, names, words):
-    with pytest.raises(InputError, match=words):
-        objectives_of(prior(), names)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum
 
-from hybrid_mpc import InputError, PriorStep, TrainingSettings, train
+from hybrid_mpc import PriorStep, TrainingSettings, train
 from hybrid_mpc.identify.dataset import in_parts
 from hybrid_mpc.identify.evaluate import unseen_runs
 from hybrid_mpc.identify.smooth import Smoother, sizes_of
@@ -45,11 +45,6 @@ def test_pieces_of_a_recording_are_cut_where_the_recording_is(data):
     # the cut lies at sample 50 of 100; 20 samples of the first piece follow it
     assert [(p.name, len(p.t)) for p in pieces] == [("file#1", 50), ("file#1", 20), ("file#2", 30)]
     assert part == [0, 1, 1]
-
-
-def test_one_part_is_refused():
-    with pytest.raises(InputError, match="HM-IDENTIFY-048"):
-        replace(SETTINGS, parts=1)
 
 
 @pytest.mark.parametrize("free", [False, True])

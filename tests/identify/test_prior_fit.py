@@ -9,12 +9,11 @@ from example_priors import TANKS, Arm, Swing, Tanks, TorchArm, TorchSwing, Torch
 from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc import InputError, Parameter, Prior, Signal, Trajectory, fit_prior
+from hybrid_mpc import InputError, Parameter, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.fit import beyond_ranges, refit, smoothed
 from hybrid_mpc.identify.fit_warnings import warnings_of
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit
-from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import Simulation, rest_of
 from hybrid_mpc.identify.windows import continued, cut_outputs
@@ -270,8 +269,6 @@ def test_it_says_what_smooths_states(noisy_runs, fit):
     truth, found = record(0, seconds=3.0), smoothed(Pendulum, fit, noisy_runs[:1], DT)[0]
     assert np.sqrt(np.mean((found.x - truth.x)[:, 0] ** 2)) < NOISE
     assert np.sqrt(np.mean((found.x - truth.x)[:, 1] ** 2)) < 0.01 * np.std(truth.x[:, 1])
-    with pytest.raises(InputError, match="HM-IDENTIFY-045"):
-        PriorFit(TRUTH, {}, (), ()).smoother(Pendulum(), DT)
 
 
 def test_progress_is_told(noisy_runs):
@@ -373,44 +370,6 @@ def test_a_parameter_at_its_bound_is_named(noisy_runs):
     found = fitted(Narrow, noisy_runs)
     assert found.values["J"] == pytest.approx(0.12, rel=1e-3)
     assert any(line.startswith("J [kg m^2] ends at a bound (0.12") for line in found.warnings)
-
-
-class Odometer(Prior):
-    """Its way is measured nowhere."""
-
-    states = (Signal("way", "m"), Signal("speed", "m/s"))
-    inputs = (Signal("force", "N"),)
-    outputs = (Signal("speed", "m/s"),)
-    parameters = (Parameter("d", 1.0, "1/s", 0.1, 10.0),)
-
-    def xdot(self, x, u, w, p):
-        return x.speed, u.force - p.d * x.speed
-
-
-def test_a_state_that_no_output_sees_is_refused_by_name():
-    run = record(0, seconds=1.0)
-    with pytest.raises(InputError, match=r"Odometer.*way.*speed.*HM-IDENTIFY-019"):
-        fit_prior(Odometer, [run], [run], dt=DT)
-
-
-def test_no_recording_and_too_short_ones_are_refused():
-    run = record(0, seconds=1.0)
-    with pytest.raises(InputError, match=r"Pendulum.*HM-IDENTIFY-017"):
-        fit_prior(Pendulum, [], [run], dt=DT)
-    with pytest.raises(InputError, match="HM-IDENTIFY-017"):
-        fit_prior(Pendulum, [run.part(slice(2))], [run], dt=DT)
-
-
-def test_a_prior_that_diverges_with_all_parameters_is_refused():
-    class Running(Pendulum):
-        """Away from where it is, faster and faster."""
-
-        def force(self, q, v, u, w, p):
-            return u.torque + 1e3 * v.phi_dot * (1 + v.phi_dot**2 + q.phi**2)
-
-    run = record(0, seconds=1.0)
-    with pytest.raises(InputError, match="HM-IDENTIFY-049"):
-        fit_prior(Running, [run], [run], dt=DT)
 
 
 # what it is made of

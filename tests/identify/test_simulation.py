@@ -7,22 +7,13 @@ import numpy as np
 import pytest
 import torch
 from example_priors import TANKS, Arm, Swing, Tanks, TorchArm, TorchSwing, TorchTanks
-from scipy.optimize._numdiff import approx_derivative
 from simulated_pendulum import Pendulum
 from torch.func import jacfwd
 
 from hybrid_mpc import InputError, OperatingPoint, Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.export import trace_model
 from hybrid_mpc.identify.prior_model import model_info
-from hybrid_mpc.identify.simulation import (
-    MAX_SUBSTEPS,
-    Simulation,
-    required_substeps,
-    rest_of,
-    substeps_for,
-    visited,
-    with_unknown_rates,
-)
+from hybrid_mpc.identify.simulation import Simulation, required_substeps, rest_of, visited, with_unknown_rates
 from hybrid_mpc.identify.step import PriorEquations, PriorStep, rk4
 from hybrid_mpc.kit.artifact import build_model
 from hybrid_mpc.model.model import step_symbols
@@ -87,23 +78,6 @@ def test_values_and_derivatives_are_those_of_torch(kind):
     np.testing.assert_array_equal(simulation.values(x0, u, w, p, SUBSTEPS), x)
     for one, other in zip(simulation.by_parameters(x0, u, w, p, SUBSTEPS), (x, by_p), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("kind", [Arm, Tanks])
-def test_derivatives_are_those_of_finite_differences(kind):
-    prior = kind()
-    x0, u, w, p = given(prior, seed=1)
-    simulation = Simulation(prior.equations.xdot, PERIOD[kind], [1, 0])
-    _, slopes = simulation.by_all(x0, u, w, p, SUBSTEPS)
-
-    def end(z):
-        q = p.copy()
-        q[[1, 0]] = z[:2]
-        return simulation.values(z[None, 2:], u[:1], w[:1], q, SUBSTEPS)[0, -1]
-
-    numeric = approx_derivative(end, np.concatenate([p[[1, 0]], x0[0]]), method="3-point")
-    # three-point differences: rounding^(2/3) of states of the order of one
-    np.testing.assert_allclose(numeric, slopes[0, -1], rtol=0, atol=1e-8)
 
 
 def test_a_disturbance_acts_in_its_own_period():
@@ -179,16 +153,6 @@ def test_sub_steps_follow_the_fastest_eigenvalue(rate, dt, needed):
     prior = Decay()
     prior.rate = rate
     assert required_substeps(prior, dt) == needed
-
-
-def test_what_is_too_stiff_is_refused_with_its_name():
-    prior = Decay()
-    prior.rate = 1e3
-    with pytest.raises(InputError, match="HM-IDENTIFY-049"):
-        required_substeps(prior, 1.01 * MAX_SUBSTEPS / 1e3)
-    prior.rate = float("nan")
-    with pytest.raises(InputError, match=r"the thing.*HM-IDENTIFY-049"):
-        substeps_for(prior.equations.xdot, [0.0], [0.0], [], [], 0.1, r"the thing.*HM-IDENTIFY-049")
 
 
 class Valve(Prior):

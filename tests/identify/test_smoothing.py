@@ -14,7 +14,7 @@ from hybrid_mpc import MechanicalPrior, OperatingPoint, Parameter, Prior, Signal
 from hybrid_mpc.data.differentiate import local_polynomial
 from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.identify.simulation import Simulation
-from hybrid_mpc.identify.smooth import IGNORANCE, Smoother, _whitened, sizes_of, unseen_states
+from hybrid_mpc.identify.smooth import IGNORANCE, Smoother, _innovations, _whitened, sizes_of, unseen_states
 from tests.simulated_pendulum import DT, TRUTH, Pendulum, record
 
 SIGMA = 1e-3
@@ -235,7 +235,7 @@ def test_the_likelihood_is_that_of_the_joint_gaussian():
     begin = within[:skip, :skip]
     squares = error @ np.linalg.solve(within, error) - error[:skip] @ np.linalg.solve(begin, error[:skip])
     logs = np.linalg.slogdet(within)[1] - np.linalg.slogdet(begin)[1]
-    found = smoother.innovations([run])
+    (found,) = _innovations([smoother], [run])
     assert found[2] == seen.sum() - skip
     # rounding of a matrix whose condition is the square of 3e3
     assert found[0] == pytest.approx(squares, rel=1e-6)
@@ -364,33 +364,6 @@ def test_what_no_output_tells_of_is_named():
 # samples that are missing or censored
 
 
-def test_missing_samples_are_passed_over():
-    truth, run = noisy(3)
-    gappy, rng = replace(run, y=run.y.copy()), np.random.default_rng(0)
-    gappy.y[rng.uniform(size=run.y.shape) < 0.5] = np.nan
-    gappy.y[100:115] = np.nan  # a third of a second
-    smoother = smoother_of(Pendulum(TRUTH), [run], DT, (SIGMA,), (0.05,))
-    whole, half = (smoother.smooth([r])[0] for r in (run, gappy))
-    assert np.isfinite(half.x).all()
-    errors = [rms((s.x - truth.x)[:, 0]) for s in (whole, half)]
-    assert errors[1] < 3 * errors[0]  # half the samples: sqrt(2), and a hole
-    assert errors[1] < SIGMA
-    # what stands in a missing sample's place does not matter: the one that is there counts as much as if alone
-    noise = fit_smoother(Pendulum(TRUTH), [gappy], DT).sigma[0]
-    assert noise == pytest.approx(SIGMA, rel=0.25)  # 93 samples: four standard errors of 7 %
-
-
-def test_an_output_of_several_may_be_missing():
-    truth = record(5)
-    y = np.column_stack([truth.x[:, 0], np.abs(truth.x[:, 1])])
-    y += np.random.default_rng(0).standard_normal(y.shape) * [1e-3, 0.01]
-    run = blind(truth, y=y.copy())
-    run.y[::2, 1], run.y[1::3, 0] = np.nan, np.nan  # sensors of other rates
-    smoothed = smoother_of(Speedometer(TRUTH), [run], DT, (1e-3, 0.01), (0.05,)).smooth([run])[0]
-    assert rms((smoothed.x - truth.x)[:, 0]) < 1e-3
-    assert rms((smoothed.x - truth.x)[:, 1]) < 0.01
-
-
 @dataclass(frozen=True)
 class Censored(Trajectory):
     """A recording of a sensor that has ends."""
@@ -448,25 +421,6 @@ def test_a_censored_sample_counts_where_the_estimate_contradicts_it():
     missing = replace(run, y=np.where(sign != 0, np.nan, y), censored=0 * sign)
     # but for the guess of the first state, known to 10 m: as the sensor to it
     np.testing.assert_allclose(below, smoother.smooth([missing])[0].x[:30, 0], atol=0.01)
-
-
-def test_sizes_follow_the_units():
-    """In millimetres and minutes they are the same sizes."""
-    runs = [blind(tank_run(seed)) for seed in range(2)]
-    sizes = sizes_of(Tanks(TANKS), runs, 0.5, 10.0)
-
-    class Millimetres(Tanks):
-        """Levels and their outputs in millimetres."""
-
-        def xdot(self, x, u, w, p):
-            return tuple(1e3 * r for r in super().xdot(type(x)(*(v / 1e3 for v in x)), u, w, p))
-
-        states = tuple(replace(s, unit="mm", upper=1e3 * s.upper) for s in Tanks.states)
-
-    scaled = [replace(run, y=1e3 * run.y) for run in runs]
-    other = sizes_of(Millimetres(TANKS), scaled, 0.5, 10.0)
-    for name in ("y", "noise", "x", "rate"):
-        np.testing.assert_allclose(getattr(other, name), 1e3 * np.array(getattr(sizes, name)), rtol=1e-9)
 
 
 def test_errors_are_whitened_where_a_diverged_filter_makes_their_covariance_singular():

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from example_priors import Swing
-from simulated_pendulum import DT, Pendulum, record
+from simulated_pendulum import DT, Pendulum
 
 from hybrid_mpc import Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.fit import smoothed
@@ -36,36 +36,29 @@ class Ranged(Pendulum):
     states = (Signal("phi", "rad", -3.2, 3.2, periodic=True), Signal("phi_dot", "rad/s", -20.0, 20.0))
 
 
-@pytest.fixture(scope="module")
-def runs():
-    rng = np.random.default_rng(1)
-    made = [record(seed) for seed in range(3)]
-    return [replace(t, y=t.y + 2e-3 * rng.standard_normal(t.y.shape)) for t in made]
-
-
-def fitted(make, runs):
-    *train, valid = runs
+def fitted(make, noisy):
+    *train, valid = noisy
     return fit_prior(make, train, [replace(valid, role="valid")], dt=DT, time_unit=SECONDS)
 
 
 @pytest.fixture(scope="module")
-def sound(runs):
-    return fitted(Pendulum, runs)
+def sound(noisy):
+    return fitted(Pendulum, noisy)
 
 
 @pytest.fixture(scope="module")
-def tight(runs):
-    return fitted(Tight, runs)
+def tight(noisy):
+    return fitted(Tight, noisy)
 
 
-def test_a_sound_fit_has_no_problem_and_no_doubt(runs, sound):
-    states = smoothed(Pendulum, sound, runs, DT)
+def test_a_sound_fit_has_no_problem_and_no_doubt(noisy, sound):
+    states = smoothed(Pendulum, sound, noisy, DT)
     assert problems(sound.smoother(Pendulum(sound.values), DT), sound, states) == ()
     assert bound_costs(Pendulum, sound, states, DT, 2.0) == ()
 
 
-def test_numbers_that_are_not_finite_are_problems(runs, sound):
-    states, smoother = smoothed(Pendulum, sound, runs, DT), sound.smoother(Pendulum(sound.values), DT)
+def test_numbers_that_are_not_finite_are_problems(noisy, sound):
+    states, smoother = smoothed(Pendulum, sound, noisy, DT), sound.smoother(Pendulum(sound.values), DT)
     cases = {
         "mgl": replace(sound, values={**sound.values, "mgl": math.nan}),
         "phi": replace(sound, sigma=(math.inf,)),
@@ -79,9 +72,9 @@ def test_numbers_that_are_not_finite_are_problems(runs, sound):
     assert found.startswith("phi_dot ")
 
 
-def test_states_that_run_away_are_problems_and_single_samples_are_none(runs, sound):
+def test_states_that_run_away_are_problems_and_single_samples_are_none(noisy, sound):
     smoother = sound.smoother(Ranged(sound.values), DT)
-    first, away = smoothed(Pendulum, sound, runs, DT)[0], smoother.bounds[1][1]
+    first, away = smoothed(Pendulum, sound, noisy, DT)[0], smoother.bounds[1][1]
     assert away == 60.0  # three times the range of 40, around its middle
     assert math.isinf(smoother.bounds[1][0])  # an angle that turns through has no end
     for share, n in ((0.02, 0), (0.2, 1)):
@@ -90,9 +83,9 @@ def test_states_that_run_away_are_problems_and_single_samples_are_none(runs, sou
         assert len(problems(smoother, sound, [replace(first, x=x)])) == n
 
 
-def test_the_cost_of_a_bound_is_that_of_a_fit_without_it(runs, tight, sound):
+def test_the_cost_of_a_bound_is_that_of_a_fit_without_it(noisy, tight, sound):
     """The stiffness of 1.2 N m may be 0.8 at most: without this bound it is found, and little is left but noise."""
-    states = smoothed(Tight, tight, runs[:2], DT)
+    states = smoothed(Tight, tight, noisy[:2], DT)
     (found,) = bound_costs(Tight, tight, states, DT, 2.0)
     assert (found.parameter, found.value) == ("mgl", pytest.approx(0.8))
     # the range of 0.3 is added to it: 1.1 is the nearest that it may be
@@ -101,10 +94,10 @@ def test_the_cost_of_a_bound_is_that_of_a_fit_without_it(runs, tight, sound):
     assert found.ratio < 0.6
 
 
-def test_a_constant_runs_at_the_mean_of_the_training_outputs(runs):
-    (found,) = constant_runs(runs[:2], runs[2:], 10)
-    assert found.shape == (len(runs[2].t) - 10, 1)
-    assert (found == np.concatenate([runs[0].y, runs[1].y]).mean()).all()
+def test_a_constant_runs_at_the_mean_of_the_training_outputs(noisy):
+    (found,) = constant_runs(noisy[:2], noisy[2:], 10)
+    assert found.shape == (len(noisy[2].t) - 10, 1)
+    assert (found == np.concatenate([noisy[0].y, noisy[1].y]).mean()).all()
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 import torch
 from example_priors import TANKS, Arm, Tanks
-from simulated_pendulum import DT, TRUTH, Pendulum, record
+from simulated_pendulum import DT, Pendulum
 
-from hybrid_mpc import HybridStep, InputError, PriorStep, Scaling, n_features
+from hybrid_mpc import HybridStep, PriorStep, Scaling, n_features
 from hybrid_mpc.identify.networks import StackedGRU
-from hybrid_mpc.identify.simulation import required_substeps
 from hybrid_mpc.identify.step import PriorEquations, rk4, shift_to
 
 UNIT = Scaling(x=(1.0, 1.0), u=(1.0,), rate=(1.0,), correction=(1.0,))
@@ -31,16 +30,6 @@ def test_rk4_is_of_order_four():
     errors = [float((end(n) - exact).norm()) for n in (20, 40, 80)]
     orders = [math.log2(a / b) for a, b in pairwise(errors)]
     assert orders == pytest.approx([4.0, 4.0], abs=0.3)  # the next term of the error is of order 5
-
-
-def test_prior_step_follows_the_true_pendulum():
-    run = record(0, seconds=2.0)
-    step = PriorStep(Pendulum(TRUTH), DT)
-    x, h = torch.tensor(run.x[0]), NONE
-    for k in range(len(run.t) - 1):
-        x, h = step(x, h, torch.tensor(run.u[k]), NONE)
-    # RK4 at 20 ms on a 3.5 rad/s oscillation: (0.07)^5 / 120 a step, 100 steps
-    np.testing.assert_allclose(x, run.x[-1], atol=2e-6)
 
 
 def test_disturbances_act_and_parameters_may_be_others():
@@ -87,47 +76,29 @@ class Ends(Arm):
 
 
 @pytest.mark.parametrize(
-    ("prior", "rows"), [(Tanks, [0, 1]), (Arm, [2, 3]), (Elbow, [3]), (Ends, [0, 3])], ids=lambda p: str(p)
+    ("prior", "rows"),
+    [(Pendulum, [1]), (Tanks, [0, 1]), (Arm, [2, 3]), (Elbow, [3]), (Ends, [0, 3])],
+    ids=lambda p: str(p),
 )
 @pytest.mark.parametrize("use_prior", [True, False])
 def test_corrections_go_to_the_states_that_the_prior_names(prior, rows, use_prior):
     made, rng = prior(), np.random.default_rng(0)
     n_x, n_u, n_w, n_c = len(made.states), len(made.inputs), len(made.disturbances), len(rows)
     scaling = Scaling((1.0,) * n_x, (1.0,) * n_u, (1.0,) * n_c, (1.0,) * n_c, (1.0,) * n_w)
-    assert HybridStep.sizes(made, use_prior)[1] == n_c
     step = HybridStep(made, torch.nn.Identity(), scaling, 0.05, use_prior=use_prior)
     x, u, w, d = (torch.tensor(rng.uniform(0.2, 1.0, (5, n))) for n in (n_x, n_u, n_w, n_c))
+    assert (step.features(x, u, w).shape[-1], n_c) == HybridStep.sizes(made, use_prior)
     own = PriorStep(made, 0.05).xdot(x, NONE, u, w)
     found = step.derivative(x, u, w, d)
     expected = own.clone()
-    expected[:, rows] = d + (
-        own[:, rows] if use_prior else 0.0
-    )  # a plain network gives the whole of its rows
+    # a plain network gives the whole of its rows
+    expected[:, rows] = d + (own[:, rows] if use_prior else 0.0)
     torch.testing.assert_close(found, expected, rtol=1e-14, atol=1e-14)
     after = step.integrate(x, u, w, d)
     exact = rk4(lambda z: step.derivative(z, u, w, d), x, 0.05, step.substeps)
     torch.testing.assert_close(after, exact, rtol=1e-14, atol=1e-14)
     rate = step.rate(x, u, w, d)
     torch.testing.assert_close(rate, (after - x) / 0.05, rtol=1e-12, atol=1e-12)
-
-
-def test_a_prior_too_stiff_for_its_period_is_refused():
-    stiff = Pendulum({"J": 0.02, "d": 0.5})
-    assert required_substeps(stiff, 0.1) >= 3  # the rate d / J = 25 1/s asks for ceil(2.5) or more
-    for make in (lambda: required_substeps(stiff, 10.0), lambda: PriorStep(stiff, 10.0)):
-        with pytest.raises(InputError, match="HM-IDENTIFY-049"):
-            make()
-
-
-@pytest.mark.parametrize("use_prior", [False, True])
-@pytest.mark.parametrize("prior", [Pendulum, Tanks, Arm])
-def test_features_are_as_many_as_a_form_says(prior, use_prior):
-    made = prior()
-    n_x, n_u, n_w, n_c = len(made.states), len(made.inputs), len(made.disturbances), len(made.corrected)
-    scaling = Scaling((1.0,) * n_x, (1.0,) * n_u, (1.0,) * n_c, (1.0,) * n_c, (1.0,) * n_w)
-    hybrid = HybridStep(made, torch.nn.Identity(), scaling, DT, use_prior=use_prior)
-    features = hybrid.features(*(torch.full((n,), 0.5).double() for n in (n_x, n_u, n_w)))
-    assert (features.numel(), n_c) == HybridStep.sizes(made, use_prior)
 
 
 def test_features_know_the_disturbances_by_their_spread():
@@ -143,5 +114,3 @@ def test_features_know_the_disturbances_by_their_spread():
 def test_another_prior_is_one_with_a_shift():
     shift = shift_to(Tanks(), {"k_1": 0.25})
     np.testing.assert_allclose(shift, [0.0, 0.0, 0.1, 0.0], atol=1e-15)
-    with pytest.raises(InputError, match=r"k_9.*HM-IDENTIFY-051"):
-        shift_to(Tanks(), {"k_9": 1.0})

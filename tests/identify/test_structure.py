@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from simulated_pendulum import DT, Pendulum, record
+from simulated_pendulum import DT, Pendulum
 
 from hybrid_mpc import InputError, MechanicalPrior, Parameter, Prior, Signal, fit_prior
 from hybrid_mpc.identify.structure import (
@@ -158,25 +158,18 @@ def test_what_a_factor_says(factor, said):
     assert bool(said) == bool(reading_of(factor))
 
 
-@pytest.fixture(scope="module")
-def runs():
-    rng = np.random.default_rng(1)
-    made = [record(seed) for seed in range(3)]
-    return [replace(t, y=t.y + 2e-3 * rng.standard_normal(t.y.shape)) for t in made]
-
-
-def found_of(make, runs):
-    *train, valid = runs
+def found_of(make, noisy):
+    *train, valid = noisy
     fit = fit_prior(make, train, [replace(valid, role="valid")], dt=DT, time_unit=SECONDS)
     return causes(make, fit.values, train, DT, 4.0, SECONDS)
 
 
-def test_a_sound_prior_is_left_alone(runs):
-    assert found_of(Pendulum, runs) == ()
+def test_a_sound_prior_is_left_alone(noisy):
+    assert found_of(Pendulum, noisy) == ()
 
 
-def test_a_wrong_sign_is_named(runs):
-    found = found_of(WrongSpring, runs)
+def test_a_wrong_sign_is_named(noisy):
+    found = found_of(WrongSpring, noisy)
     assert "potential" in found[0].what
     assert "sign" in found[0].why
     assert found[0].ratio < 0.1
@@ -198,8 +191,8 @@ class Small(Pendulum):
 
 
 @pytest.mark.parametrize(("make", "factor"), [(Large, 1e-3), (Small, 1e5)])
-def test_a_wrong_unit_is_named(runs, make, factor):
-    first = found_of(make, runs)[0]
+def test_a_wrong_unit_is_named(noisy, make, factor):
+    first = found_of(make, noisy)[0]
     assert "force" in first.what or "input" in first.what
     assert first.factor == pytest.approx(factor)
     assert first.exact
@@ -212,30 +205,30 @@ class Stiff(Pendulum):
         return (1e6 * p.d * v.phi_dot,)
 
 
-def test_a_unit_that_makes_a_prior_too_stiff_is_named(runs):
+def test_a_unit_that_makes_a_prior_too_stiff_is_named(noisy):
     with pytest.raises(InputError):
-        fit_prior(Stiff, runs, runs, dt=DT)
-    first = causes_of_refusal(Stiff, runs, DT, 4.0, SECONDS)[0]
+        fit_prior(Stiff, noisy, noisy, dt=DT)
+    first = causes_of_refusal(Stiff, noisy, DT, 4.0, SECONDS)[0]
     assert "friction" in first.what
     assert first.factor in (1e-5, 1e-6)  # what is left of it hardly acts
     assert "spread" in str(first)
 
 
-def test_a_prior_that_is_not_refused_has_no_such_cause(runs):
-    assert causes_of_refusal(Pendulum, runs, DT, 4.0, SECONDS) == ()
+def test_a_prior_that_is_not_refused_has_no_such_cause(noisy):
+    assert causes_of_refusal(Pendulum, noisy, DT, 4.0, SECONDS) == ()
 
 
 @pytest.mark.parametrize("key", ["y", "u"])
-def test_a_signal_that_is_counted_the_other_way_is_named(runs, key):
+def test_a_signal_that_is_counted_the_other_way_is_named(noisy, key):
     """An angle with the wrong sign is one with an input of the wrong sign: an odd machine cannot tell them apart."""
-    found = found_of(Pendulum, [replace(t, **{key: -getattr(t, key)}) for t in runs])
+    found = found_of(Pendulum, [replace(t, **{key: -getattr(t, key)}) for t in noisy])
     assert any("torque" in one.what or "phi" in one.what for one in found)
     assert all("sign" in one.why or "other way" in one.why for one in found[:1])
 
 
-def test_slopes_by_a_held_factor_are_left_out(runs):
+def test_slopes_by_a_held_factor_are_left_out(noisy):
     """Outputs and the other slopes are those with a free factor, whose column is zero where it is held."""
-    windows = cut_outputs(runs, 20, 0, 3, Pendulum.states)
+    windows = cut_outputs(noisy, 20, 0, 3, Pendulum.states)
     fit = _FactorFit(Pendulum, DT)
     theta = np.append(fit.nominal[:-1], -1.0)
     free, held = (
@@ -253,15 +246,6 @@ def test_slopes_by_a_held_factor_are_left_out(runs):
         for way in (step, -step)
     )
     np.testing.assert_allclose(free[1][..., factor], (more - less) / (2 * step), rtol=1e-4, atol=1e-7)
-
-
-def test_equal_explanations_are_named_together():
-    both = named(
-        [Cause("a", "its sign seems wrong", 0.1, -1.0), Cause("b", "they seem to be exchanged", 0.1)]
-    )
-    assert both.startswith("a: its sign seems wrong (factor -1)")
-    assert "b: they seem to be exchanged; corrected" in both
-    assert named([]) == ""
 
 
 @pytest.mark.parametrize(

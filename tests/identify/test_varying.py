@@ -1,4 +1,4 @@
-"""Which parameters differ between recordings, and predictions from the observer's state with and without tracking."""
+"""Parameters that differ between recordings, fits of each alone, and predictions with and without tracking."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
 from hybrid_mpc.identify.ahead import _unlearned, choose_tracked, errors_ahead
+from hybrid_mpc.identify.own_fits import fit_each
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
 from hybrid_mpc.identify.varying import find_varying
 from hybrid_mpc.kit.artifact import build_model
@@ -42,15 +43,15 @@ class Twins(Heater):
         return ((p.gain * p.share * u.power - x.heat) / p.tau,)
 
 
-def recorded(gains, *, bias=0.0, seconds=40.0, seed=0):
-    """A recording for each gain, exactly integrated, with white noise."""
+def recorded(gains, *, bias=0.0, seconds=40.0, seed=0, late=0, sigma=SIGMA):
+    """A recording for each gain, exactly integrated, with white noise; inputs act ``late`` periods later."""
     rng, found, n = np.random.default_rng(seed), [], round(seconds / DT)
     for i, gain in enumerate(gains):
         u = np.repeat(rng.uniform(-2.0, 2.0, n // 8 + 1), 8)[:n, None]
-        x, a = np.zeros((n, 1)), np.exp(-DT)
+        acts, x, a = np.concatenate([np.repeat(u[:1], late, axis=0), u])[:n], np.zeros((n, 1)), np.exp(-DT)
         for k in range(n - 1):
-            x[k + 1] = a * x[k] + (1 - a) * gain * (u[k] + bias)
-        y, t = x + SIGMA * rng.standard_normal(x.shape), np.arange(n) * DT
+            x[k + 1] = a * x[k] + (1 - a) * gain * (acts[k] + bias)
+        y, t = x + sigma * rng.standard_normal(x.shape), np.arange(n) * DT
         nothing = np.full(x.shape, np.nan)
         zeros = np.zeros(y.shape, dtype=np.int8)
         found.append(Trajectory(f"day{i}", "train", DT, t, u, y, nothing, nothing, np.zeros((n, 0)), zeros))
@@ -76,6 +77,8 @@ def test_the_spread_between_recordings_is_recovered():
     true = float(np.std(GAINS, ddof=1))
     assert own["gain"].std == pytest.approx(true, rel=0.25)
     assert own["gain"].gain > 20
+    assert own["gain"].tracked() == TrackedParameter("gain", own["gain"].std / own["gain"].value, True)
+    assert found.rows()[0]["varies"] is True
     assert own["tau"].std == own["bias"].std == 0.0
 
 
@@ -114,17 +117,6 @@ def test_the_user_decides():
     assert own["gain"].declared
     assert own["bias"].std == pytest.approx(0.05)
     assert own["tau"].std > 0
-    for wrong, code in ((0.0, "MACHINE-045"), (-1.0, "MACHINE-045"), (float("nan"), "RECORDS-012")):
-        with pytest.raises(InputError, match=code):
-            Parameter("k", 1.0, "-", 0.0, 2.0, varies=wrong)
-
-
-def test_recordings_that_are_too_short_are_refused():
-    recordings = recorded([2.0, 2.1])
-    fit = fit_prior(Heater, recordings, [], dt=DT, length=4.0)
-    short = [t.part(slice(20)) for t in recordings]
-    with pytest.raises(InputError, match="HM-IDENTIFY-078"):
-        find_varying(Heater, fit, short, dt=DT, length=4.0)
 
 
 def observer(fit, make=Heater):
@@ -157,12 +149,6 @@ def test_nothing_is_tracked_that_does_not_vary():
     assert dict(chosen.ratio) == {"heat": 1.0}
 
 
-def test_a_prediction_needs_a_recording_longer_than_its_horizon():
-    fit, _ = varying_of(Heater, recorded([2.0] * 2))
-    with pytest.raises(InputError, match="HM-IDENTIFY-079"):
-        errors_ahead(observer(fit), recorded([2.0], seconds=10.0), 20.0)
-
-
 def test_errors_are_zero_for_the_exact_model_without_noise():
     fit, _ = varying_of(Heater, recorded([2.0] * 2))
     exact = observer(fit)
@@ -174,13 +160,8 @@ def test_errors_are_zero_for_the_exact_model_without_noise():
         clean.append(x.ravel())
     errors = errors_ahead(exact, [replace(t, y=np.array(clean))], 1.0)
     assert errors.pooled[0] < 1e-9
-
-
-def test_tracked_entries_carry_the_scale():
-    _, found = varying_of(Heater, recorded(GAINS))
-    gain = found.parameters[0]
-    assert gain.tracked() == TrackedParameter("gain", gain.std / gain.value, True)
-    assert found.rows()[0]["varies"] is True
+    with pytest.raises(InputError, match="HM-IDENTIFY-079"):  # no recording is longer than the horizon
+        errors_ahead(exact, [t], 60.0)
 
 
 class Scaled(Heater):
@@ -224,3 +205,57 @@ def test_a_load_that_stays_beside_an_unlearned_parameter_is_doubted():
     assert "HM-IDENTIFY-083" in doubt
     assert "gain" in doubt
     assert _unlearned(made, recorded(GAINS[:3], seed=5), (gain,)) == ()
+
+
+# fits of each recording alone
+
+
+class Plain(Heater):
+    """The heater without a bias."""
+
+    parameters = Heater.parameters[:2]
+
+    def xdot(self, x, u, w, p):
+        return ((p.gain * u.power - x.heat) / p.tau,)
+
+
+DAYS = (0.8, 3.6, 2.0, 1.2, 2.8)
+
+
+def days(gains, late=0):
+    return recorded(gains, seconds=60.0, late=late, sigma=0.02)
+
+
+def own_fits(recordings):
+    fit = fit_prior(Plain, recordings, [], dt=DT, length=4.0)
+    return fit, fit_each(Plain, fit, recordings, dt=DT, length=4.0)
+
+
+def test_a_late_input_shows_in_each_recording_where_days_differ():
+    fit, found = own_fits(days(DAYS, late=1))
+    assert not any("HM-IDENTIFY-080" in one for one in fit.warnings)  # the common fit does not see it
+    assert len(found.late) == len(DAYS)
+    assert [one.delay for one in found.late] == pytest.approx([DT] * len(DAYS), rel=0.2)
+    assert found.varying.names == ("gain",)
+    # the lacking delay biases the gains, but keeps their order
+    assert np.argsort(found.values["gain"]).tolist() == np.argsort(DAYS).tolist()
+    assert [code for code in ("081", "082") if any(f"HM-IDENTIFY-{code}" in one for one in found.warnings)]
+    assert "0.1 s" in found.warnings[0]
+
+
+def test_days_that_differ_have_own_values_and_no_late_input():
+    _, found = own_fits(days(DAYS))
+    assert not found.late
+    # beside the common tau, which the differences bias
+    assert found.values["gain"] == pytest.approx(DAYS, rel=0.06)
+    assert found.ratio < 0.2
+    (warning,) = found.warnings
+    assert "HM-IDENTIFY-082" in warning
+    assert f"day1 {found.values['gain'][1]:.3g}" in warning
+
+
+def test_equal_days_need_no_warning():
+    _, found = own_fits(days([2.0] * 5))
+    assert found.warnings == ()
+    assert found.ratio == 1.0
+    assert fit_each(Plain, _, [t.part(slice(20)) for t in days([2.0])], dt=DT, length=4.0) is None

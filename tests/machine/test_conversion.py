@@ -49,18 +49,9 @@ def test_a_unit_that_nobody_knows_is_itself():
     assert conversion("counts", "counts") == Conversion(1.0)
 
 
-@pytest.mark.parametrize(
-    ("unit", "seconds"),
-    [
-        ("\u00b5s", 1e-6),
-        ("\u03bcs", 1e-6),
-        ("us", 1e-6),
-        ("msec", 1e-3),
-        ("ms", 1e-3),
-        ("hr", 3600.0),
-        ("Min", 60.0),
-        ("V", None),
-    ],
-)
+@pytest.mark.parametrize(("unit", "seconds"), [
+    ("\u00b5s", 1e-6), ("\u03bcs", 1e-6), ("us", 1e-6), ("msec", 1e-3), ("ms", 1e-3), ("hr", 3600.0), ("Min", 60.0),
+    ("V", None),
+])  # fmt: skip
 def test_one_table_of_times(unit, seconds):
     assert time_factor(unit) == seconds

@@ -200,6 +200,7 @@ def test_the_call_that_makes_a_term_makes_it_again():
     for term in arm_terms(0.25).values():
         again = eval(term.code, {"terms": terms, "Parameter": Parameter})
         assert (again, again.code) == (term, term.code)
+    assert "width=0.2)" in terms.coulomb("v1", p("F"), width=np.float64(0.2)).code  # a file has no numpy
 
 
 def test_friction_torques_are_the_hand_written_formulas_and_only_take_energy():

@@ -24,7 +24,6 @@ from hybrid_mpc.identify.evaluate import (
     OutputErrors,
     evaluation_trajectories,
     free_runs,
-    measured_as,
     output_errors,
     run_length,
     score,
@@ -36,6 +35,7 @@ from hybrid_mpc.identify.own_fits import fit_each
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
+from hybrid_mpc.identify.simulation import measured_as
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.sound import (
     BoundCost,
@@ -382,7 +382,7 @@ def examined_prior(context: Context) -> PriorResult:
     in_doubt = (*([wrong] if wrong else []), *lacking)
     for doubt in in_doubt:
         context.progress.warn(f"{IN_DOUBT}: {doubt}")
-    one_step = smoother.prediction_errors(acting, fitted.p[None])[1]
+    one_step = smoother.prediction_errors(acting)
     return PriorResult(
         fit=fit,
         nominal=make().values,
