@@ -629,6 +629,12 @@ class Problem:
         """Bounds ``(n_x,)`` beyond which a plan diverges; infinite for periodic states and open ranges."""
         self.usable: tuple[Array, Array] = lower - USABLE * width, upper + USABLE * width
         """Bounds ``(n_x,)`` within which a free run is a first plan, likewise."""
+        followed, weight = (model.outputs, ocp.q_y) if ocp.n_y else (model.states, ocp.q)
+        pairs = zip(followed, weight.tolist(), strict=True)
+        names = [f"{s.name} [{s.unit}]" if q else f"{s.name} [{s.unit}], without weight" for s, q in pairs]
+        names += [f"parameter {i + 1} of cost and bounds" for i in range(ocp.n_p)]
+        self.reference_name = f"reference ({'outputs' if ocp.n_y else 'states'}: {'; '.join(names)})"
+        """Name of a reference with its columns in their order, for messages."""
 
     def diverges(self, x: Array) -> bool:
         """True if states ``(n, n_x)`` lie further outside of their declared ranges than :data:`BEYOND` widths."""
@@ -678,7 +684,7 @@ class Problem:
             start: Steady state from which those of an outputs' reference are searched.
         """
         n, m, ocp = self.ocp.horizon, self.model, self.ocp
-        rows = self._preview(reference, "reference", ocp.columns)
+        rows = self._preview(reference, self.reference_name, ocp.columns)
         p, weights = rows[:, ocp.columns - ocp.n_p :], self.weights(weight)
         d = np.zeros(m.n_d) if estimate is None else estimate.d
         ahead = self.forecast(w, estimate)

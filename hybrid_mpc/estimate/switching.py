@@ -131,7 +131,6 @@ class SwitchingFilter:
         self._noise, self._noise_y = (np.stack(one) for one in zip(*noises, strict=True))
         self._most = np.array([f.most for f in filters])
         self._unit = np.tile(np.eye(n_z + model.n_d), (m, 1, 1))
-        assert model.with_jacobian is not None
         self._step, self._output = (
             BufferedFunction(f.map(m)) for f in (model.with_jacobian, output_with_jacobian(model))
         )

@@ -29,13 +29,14 @@ from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import (
-    Balance,
     HybridModel,
     ManyPoints,
     SideBySide,
+    at_arguments,
     inlined,
     step_function,
     step_symbols,
+    with_slopes,
 )
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Name, Positive
@@ -157,24 +158,9 @@ def with_tracked(model: HybridModel, tracked: Sequence[TrackedParameter]) -> Hyb
     n_w, places = model.n_w, _places(model, tracked)
     x, h, u, _, p = step_symbols(model)
     w = ca.MX.sym("w", n_w + len(places))
-    own, chosen = w[:n_w], _exchanged(p, places, w[n_w:])
-    point, given = [x, h, u, w, p], [x, h, u, own, chosen]
-    rate = ca.MX.sym("rate", model.n_x)
-    assert model.with_jacobian is not None
     parameters = [_parameter(model, one.name) for one in tracked]
-    return replace(
-        model,
-        step=step_function("step", point, inlined(model.step, given)),
-        xdot=ca.Function("xdot", point, inlined(model.xdot, given), ["x", "h", "u", "w", "p"], ["xdot"]),
-        output=ca.Function(
-            "output", [x, u, w, p], inlined(model.output, [x, u, own, chosen]), ["x", "u", "w", "p"], ["y"]
-        ),
-        with_jacobian=step_function("with_jacobian", point, inlined(model.with_jacobian, given)),
-        balances=tuple(
-            Balance(b.name, b.unit, b.rate_unit, ca.Function(
-                "residual", [x, rate, u, w, p], inlined(b.residual, [x, rate, u, own, chosen])))
-            for b in model.balances
-        ),
+    return at_arguments(
+        model, [x, h, u, w, p], [x, h, u, w[:n_w], _exchanged(p, places, w[n_w:])],
         side_by_side=None if model.side_by_side is None else _side_by_side(model.side_by_side, n_w, places),
         disturbances=(*model.disturbances, *(_signal(p) for p in parameters)),
         nominal_w=(*model.w.tolist(), *(p.value for p in parameters)),
@@ -235,11 +221,12 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
     decay = ca.DM([one.decay(model.dt) for one in tracked])
     point = [x, h, u, w, p]
     x_next, h_next = inlined(model.step, [x, h[:n_h], u, w, chosen])
+    step = step_function("step", point, [x_next, ca.vertcat(h_next, decay * theta)])
     return replace(
         model,
-        step=step_function("step", point, [x_next, ca.vertcat(h_next, decay * theta)]),
+        step=step,
         xdot=ca.Function("xdot", point, [ca.densify(model.xdot(x, h[:n_h], u, w, chosen))]),
-        with_jacobian=None,
+        with_jacobian=with_slopes(step),
         side_by_side=None,
     )
 
