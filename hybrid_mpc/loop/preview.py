@@ -33,7 +33,9 @@ class Previews:
         self._reference, self._weight = _function_of(reference, problem), weight
         self._end = float(sampled(end, (), "end"))
         self._n_x, self._columns = ocp.n_x, ocp.columns
-        self._ahead: Array = np.arange(ocp.horizon + 1 if ocp.preview else 1) * problem.model.dt
+        self._ahead: Array = problem.model.dt * np.arange(
+            ocp.horizon + 1 if ocp.preview else 1, dtype=np.float64
+        )
 
     def __call__(self, t: float) -> tuple[Array, Array | None]:
         """Reference and factors (None for 1) from ``t`` on."""

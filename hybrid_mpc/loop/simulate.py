@@ -134,10 +134,8 @@ def simulate(
     if not isinstance(faults, list | tuple) or not all(isinstance(fault, Fault) for fault in faults):
         raise InputError(f"faults: give a list of Fault, got {type(faults).__name__} [HM-LOOP-044]")
     seed = whole(seed, "seed", 0, 2**63 - 1)
-    sensor_delay, input_delay = (
-        whole_periods(sensor_delay, "sensor_delay"),
-        whole_periods(input_delay, "input_delay"),
-    )
+    sensor_delay = whole_periods(sensor_delay, "sensor_delay")
+    input_delay = whole_periods(input_delay, "input_delay")
     n_w = estimator.model.n_w - n_tracked(estimator)
     surroundings = _make_disturbances(w, estimator.model, n_w)
     loop = Loop(
@@ -427,13 +425,8 @@ def _label_columns(name: str, n: int, model: HybridModel | None) -> list[str]:
         return [f"{name}_{i}" for i in range(n)]
     if name == "d" and model.disturbance_model is not None:
         return [f"d {d.at} {d.signal}" for d in model.disturbance_model]
-    groups = {
-        "y": model.outputs,
-        "y_ref": model.outputs,
-        "u": model.inputs,
-        "d": model.inputs,
-        "w": model.disturbances,
-    }
+    outputs, inputs = model.outputs, model.inputs
+    groups = {"y": outputs, "y_ref": outputs, "u": inputs, "d": inputs, "w": model.disturbances}
     signals = groups.get(name, model.states)
     if len(signals) != n:
         raise InputError(

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.watch.diagnose import BLIND, Diagnoser
 from hybrid_mpc.watch.monitor import Monitor
 from hybrid_mpc.watch.readings import Validity
-from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, replay
+from hybrid_mpc.watch.replay import Trace, TrajectoryLike, replay
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ class Alarm:
 
 def explained(
     monitor: Monitor,
-    estimator: EstimatorLike,
+    estimator: Estimator,
     recording: TrajectoryLike,
     diagnoser: Callable[[], Diagnoser] | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -96,12 +97,6 @@ def table(trace: Trace, y: Array, outputs: Sequence[Signal], monitor: Monitor) -
     columns |= {f"{name}_frozen": trace.frozen[:, i] for i, name in enumerate(trace.outputs)}
     columns |= {"share": trace.share, "valid": trace.validity == Validity.VALID, "alarm": trace.alarm}
     text = io.StringIO()
-    np.savetxt(
-        text,
-        np.column_stack([*columns.values()]),
-        fmt="%.9g",
-        delimiter=",",
-        header=",".join(columns),
-        comments="",
-    )
+    rows, header = np.column_stack([*columns.values()]), ",".join(columns)
+    np.savetxt(text, rows, fmt="%.9g", delimiter=",", header=header, comments="")
     return text.getvalue()

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.data.scales import noise_of
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.watch.detector import ChannelLimit, Detector, WatchLimits
 from hybrid_mpc.watch.lengths import BLOCK_S, block_seconds, settling_samples
 from hybrid_mpc.watch.monitor import Monitor
 from hybrid_mpc.watch.readings import ENERGY, FROZEN_STEPS, Readings, Test
-from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, replay, stretches
+from hybrid_mpc.watch.replay import Trace, TrajectoryLike, replay, stretches
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,7 +37,7 @@ NEVER = 1e300
 
 def learn_limits(
     readings: Readings,
-    estimator: EstimatorLike,
+    estimator: Estimator,
     recordings: Iterable[TrajectoryLike],
     *,
     false_alarms_per_hour: float | Sequence[float] = 1.0,
@@ -146,26 +147,15 @@ def limits_of(
             for one, runs in zip(found, levels, strict=True)
         ]
     travel, repeats = _freezing(readings, ys, traces, masks, resolution)
-    method = (
-        f"{MARGIN} x the highest nominal level ({short})"
-        if short
-        else f"extreme values of blocks of {block_s:g} s"
-    )
+    method = f"{MARGIN} x the highest nominal level ({short})" if short else (
+        f"extreme values of blocks of {block_s:g} s"
+    )  # fmt: skip
     rest = tuple(getattr(readings, "rest_speed", ()))
     return WatchLimits(
-        kind=readings.kind,
-        dt=model.dt,
-        channels=tuple(found),
-        travel=travel,
-        repeats=repeats,
-        false_alarms_per_hour=rate,
-        hours=seconds / 3600,
-        method=method,
-        rated=not short,
-        rest_speed=rest,
-        data_hash=data_hash,
-        time_unit=model.time_unit,
-    )
+        kind=readings.kind, dt=model.dt, channels=tuple(found), travel=travel, repeats=repeats,
+        false_alarms_per_hour=rate, hours=seconds / 3600, method=method, rated=not short, rest_speed=rest,
+        data_hash=data_hash, time_unit=model.time_unit,
+    )  # fmt: skip
 
 
 def settled(mask: ArrayLike, first: int) -> Mask:

@@ -10,22 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.watch.monitor import Monitor, Reading
 from hybrid_mpc.watch.readings import SECONDS, Channel
 
 Array = NDArray[np.float64]
 REPORTED = 500
 """Samples between two progress reports."""
-
-
-class EstimatorLike(Protocol):
-    """Interface of the estimator in a replay; estimates have ``x`` (n_x,) and ``h`` (n_h,)."""
-
-    def start(self, y: Array, t: float) -> Any:
-        """Estimate at the first sample; with measured disturbances ``start(y, t, w=w)``."""
-
-    def update(self, estimate: Any, y: Array, u_prev: Array) -> Any:
-        """Estimate at the next sample, one period later; with measured disturbances ``update(..., w=w)``."""
 
 
 class TrajectoryLike(Protocol):
@@ -128,20 +119,8 @@ def trace_of(monitor: Monitor, t: ArrayLike, readings: Sequence[Reading]) -> Tra
     outputs = tuple(s.name for s in monitor.model.outputs)
     shape = (n, len(channels), monitor.readings.n_terms)
     terms = np.array([r.terms for r in readings]).reshape(shape) if shape[2] else np.zeros(shape)
-    columns: dict[str, Any] = {
-        name: np.array([getattr(r, name) for r in readings])
-        for name in (
-            "values",
-            "share",
-            "travel",
-            "repeats",
-            "inside",
-            "settled",
-            "alarm",
-            "validity",
-            "blind",
-        )
-    }
+    names = "values", "share", "travel", "repeats", "inside", "settled", "alarm", "validity", "blind"
+    columns: dict[str, Any] = {name: np.array([getattr(r, name) for r in readings]) for name in names}
     return Trace(
         np.asarray(t, dtype=np.float64), channels, outputs, terms=terms,
         levels=np.array([r.levels for r in readings]).reshape(n, -1),
@@ -152,7 +131,7 @@ def trace_of(monitor: Monitor, t: ArrayLike, readings: Sequence[Reading]) -> Tra
 
 def replay(
     monitor: Monitor,
-    estimator: EstimatorLike,
+    estimator: Estimator,
     recording: TrajectoryLike,
     *,
     on_sample: Callable[[int, Any], None] = lambda k, estimate: None,
