@@ -99,7 +99,7 @@ def tracked_values(model: HybridModel, tracked: Sequence[TrackedParameter], thet
     """Values ``(n_t,)`` [their units] of the tracked parameters for deviations ``theta`` ``(n_t,)``, within bounds."""
     found = []
     for one, t in zip(tracked, ca.vertsplit(theta), strict=True):
-        p = _parameter(model, one.name)
+        p = next(p for p in model.parameters if p.name == one.name)
         down, up = _room(p, one)
         saturated = up * ca.tanh(ca.fmax(t, 0) / up) + down * ca.tanh(ca.fmin(t, 0) / down)
         value = p.value * ca.exp(saturated) if one.relative else p.value + saturated
@@ -154,11 +154,10 @@ def with_tracked(model: HybridModel, tracked: Sequence[TrackedParameter]) -> Hyb
         >>> float(tracking.step(0.0, [], 1.0, [3.0], tracking.p)[0])
         3.0
     """
-    _check(model, tracked)
     n_w, places = model.n_w, _places(model, tracked)
     x, h, u, _, p = step_symbols(model)
     w = ca.MX.sym("w", n_w + len(places))
-    parameters = [_parameter(model, one.name) for one in tracked]
+    parameters = [model.parameters[i] for i in places]
     return at_arguments(
         model, [x, h, u, w, p], [x, h, u, w[:n_w], _exchanged(p, places, w[n_w:])],
         side_by_side=None if model.side_by_side is None else _side_by_side(model.side_by_side, n_w, places),
@@ -205,7 +204,6 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
     Raises:
         InputError: If a parameter is unknown, or appears in the output equation.
     """
-    _check(model, tracked)
     places, n_h = _places(model, tracked), model.n_h
     x, _, u, w, p = step_symbols(model)
     shown = shown_parameters(model)
@@ -232,15 +230,7 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
 
 
 def _places(model: HybridModel, tracked: Sequence[TrackedParameter]) -> list[int]:
-    names = [p.name for p in model.parameters]
-    return [names.index(one.name) for one in tracked]
-
-
-def _parameter(model: HybridModel, name: str) -> Parameter:
-    return next(p for p in model.parameters if p.name == name)
-
-
-def _check(model: HybridModel, tracked: Sequence[TrackedParameter]) -> None:
+    """Indices of the tracked parameters among the model's."""
     names, known = [one.name for one in tracked], [p.name for p in model.parameters]
     if not names or len(set(names)) < len(names):
         raise InputError(
@@ -252,6 +242,7 @@ def _check(model: HybridModel, tracked: Sequence[TrackedParameter]) -> None:
                 f"tracked parameters: model {model.name} has no parameter {name!r}; known names: "
                 f"{', '.join(known) or 'none'} [HM-ESTIMATE-025]"
             )
+    return [known.index(name) for name in names]
 
 
 @dataclass(frozen=True)
