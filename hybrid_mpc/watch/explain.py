@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.machine.signals import Signal
 from hybrid_mpc.watch.diagnose import BLIND, Diagnoser
 from hybrid_mpc.watch.monitor import Monitor
 from hybrid_mpc.watch.readings import Validity
-from hybrid_mpc.watch.replay import Trace, TrajectoryLike, replay
+from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, replay
 
 Array = NDArray[np.float64]
 
@@ -34,7 +33,7 @@ class Alarm:
 
 def explained(
     monitor: Monitor,
-    estimator: Estimator,
+    estimator: EstimatorLike,
     recording: TrajectoryLike,
     diagnoser: Callable[[], Diagnoser] | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,

@@ -12,12 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.data.scales import noise_of
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.watch.detector import ChannelLimit, Detector, WatchLimits
 from hybrid_mpc.watch.lengths import BLOCK_S, block_seconds, settling_samples
 from hybrid_mpc.watch.monitor import Monitor
 from hybrid_mpc.watch.readings import ENERGY, FROZEN_STEPS, Readings, Test
-from hybrid_mpc.watch.replay import Trace, TrajectoryLike, along, replay, stretches
+from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, along, replay, stretches
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,7 +36,7 @@ NEVER = 1e300
 
 def learn_limits(
     readings: Readings,
-    estimator: Estimator,
+    estimator: EstimatorLike,
     recordings: Iterable[TrajectoryLike],
     *,
     false_alarms_per_hour: float | Sequence[float] = 1.0,

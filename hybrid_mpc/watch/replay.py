@@ -10,13 +10,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.watch.monitor import Monitor, Reading
 from hybrid_mpc.watch.readings import SECONDS, Channel
 
 Array = NDArray[np.float64]
 REPORTED = 500
 """Samples between two progress reports."""
+
+
+class EstimatorLike(Protocol):
+    """Interface of the estimator in a replay; estimates have ``x`` (n_x,) and ``h`` (n_h,)."""
+
+    def start(self, y: Array, t: float) -> Any:
+        """Estimate at the first sample; with measured disturbances ``start(y, t, w=w)``."""
+
+    def update(self, estimate: Any, y: Array, u_prev: Array) -> Any:
+        """Estimate at the next sample, one period later; with measured disturbances ``update(..., w=w)``."""
 
 
 class TrajectoryLike(Protocol):
@@ -131,7 +140,7 @@ def trace_of(monitor: Monitor, t: ArrayLike, readings: Sequence[Reading]) -> Tra
 
 def replay(
     monitor: Monitor,
-    estimator: Estimator,
+    estimator: EstimatorLike,
     recording: TrajectoryLike,
     *,
     on_sample: Callable[[int, Any], None] = lambda k, estimate: None,

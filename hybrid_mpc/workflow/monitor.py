@@ -11,7 +11,6 @@ from hybrid_mpc.compare.controllers import find_noise
 from hybrid_mpc.data.trajectories import Cut, Dataset, load_trajectories
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.files import read_object, write_json, write_text
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.assembly import sensor_steps
@@ -25,7 +24,7 @@ from hybrid_mpc.watch.learn import learn_limits
 from hybrid_mpc.watch.lengths import rest_speeds
 from hybrid_mpc.watch.monitor import Monitor, make_monitor, make_readings, reads_energy
 from hybrid_mpc.watch.readings import ENERGY, RESIDUALS
-from hybrid_mpc.watch.replay import along
+from hybrid_mpc.watch.replay import EstimatorLike, along
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class MonitorJob:
         return self.kit.models[self.kit.recommended]
 
     @cached_property
-    def estimator(self) -> Estimator:
+    def estimator(self) -> EstimatorLike:
         """The estimator of the closed loops."""
         return self.kit.observer()
 
