@@ -435,7 +435,6 @@ class OCP:
 
 
 def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:
-    """Soft or hard bounds, as a tuple."""
     example = f"{kind.__name__}({'expression' if kind is SoftBound else 'what'}, lower, upper, ...)"
     if not isinstance(given, tuple | list):
         raise InputError(f"{name}: must be a list of {example}, got {given!r:.80} [HM-CONTROL-013]")
@@ -445,7 +444,6 @@ def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:
 
 
 def _check_hard(hard: Sequence[HardBound], n_x: int, n_y: int) -> None:
-    """Refuse hard bounds whose size differs from that of states or outputs."""
     for bound in hard:
         needed = {"x": n_x, "y": n_y}.get(bound.what if isinstance(bound.what, str) else "", 0)
         if needed and bound.lower.size != needed:
@@ -484,7 +482,6 @@ def _largest_change(value: ArrayLike, n_u: int) -> Array:
 
 
 def _plans(starts: object, horizon: int, n_u: int) -> tuple[Array, ...]:
-    """Input plans, as a tuple."""
     if not isinstance(starts, tuple | list | np.ndarray):
         raise InputError(f"starts: must be a list of input plans, got {starts!r:.80} [HM-CONTROL-019]")
     for i, plan in enumerate(starts):
@@ -512,7 +509,6 @@ def _diagonal(values: ArrayLike, name: str) -> Array:
 
 
 def _weights(values: ArrayLike, name: str) -> Array:
-    """Weights, finite and not negative."""
     array = numbers(values, name, most=LARGEST)
     if not (np.all(np.isfinite(array)) and np.all(array >= 0)):
         raise InputError(f"{name}: weights must be finite and not negative, got {array} [HM-CONTROL-022]")
@@ -542,7 +538,6 @@ def input_plan(value: ArrayLike, horizon: int, n_u: int, name: str) -> Array:
 
 
 def _point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
-    """A finite state ``(n_x,)`` and input ``(n_u,)``."""
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise InputError(
             f"working_point: must be (x, u), a state and an input, got {value!r} [HM-CONTROL-025]"

@@ -420,7 +420,6 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
 
 
 def _and(rows: NDArray[Scalar], row: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Rows and another one."""
     return np.concatenate([rows, row[None]])
 
 

@@ -171,7 +171,6 @@ def _signal(p: Parameter) -> Signal:
 
 
 def _exchanged(p: ca.MX, places: Sequence[int], values: ca.MX) -> ca.MX:
-    """Parameters of which some are exchanged."""
     every = ca.vertsplit(p)
     for i, value in zip(places, ca.vertsplit(values), strict=True):
         every[i] = value

@@ -254,7 +254,6 @@ def load(folder: str | Path) -> Kit:
 
 
 def _named(name: object, what: str) -> str:
-    """The given name; InputError if it is not a text."""
     if not isinstance(name, str):
         raise InputError(f"{what}: give a name, got {type(name).__name__} [HM-KIT-004]")
     return name

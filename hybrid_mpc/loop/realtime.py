@@ -218,7 +218,6 @@ class Runner:
 
 
 def _read_answer(answer: object) -> bool:
-    """The answer of ``stop()`` as a bool."""
     try:
         return bool(answer)
     except ValueError as error:  # several numbers

@@ -154,7 +154,6 @@ def _stage(model: HybridModel) -> ca.Function:
 
 
 def _point(model: HybridModel, z: ca.MX, v: ca.MX) -> list[ca.MX]:
-    """Arguments of the model's step."""
     n_u, more = model.n_u, model.n_u + model.n_w
     u = v if v.numel() == n_u else v[:n_u]
     w = v[n_u:more] if model.n_w else ca.MX(ca.DM(model.w))
