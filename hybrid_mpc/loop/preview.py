@@ -114,7 +114,8 @@ def shortest_way(reference: Array, now: Array, period: Array) -> Array:
     """
     n = now.size
     rows = np.vstack([np.where(np.isfinite(now), now, reference[0, :n]), reference[:, :n]])
-    with np.errstate(invalid="ignore"):  # values that are not finite stay so
+    # after a value that is not finite none is: no plan follows such a reference anyway
+    with np.errstate(over="ignore", invalid="ignore"):
         for i in np.flatnonzero(np.isfinite(period)):
             rows[:, i] = np.unwrap(rows[:, i], period=period[i])
     return np.hstack([rows[1:], reference[:, n:]])

@@ -249,7 +249,8 @@ def _build_result(
     rows: Sequence[Mapping[str, Any]], dt: float, switches: tuple[Switch, ...]
 ) -> ClosedLoopResult:
     columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
-    timing = {name: 1e3 * np.array([spent[name] for spent in columns["timing_ms"]]) for name in TIMED}
+    seconds = columns.pop("timing_ms")
+    timing = {name: 1e3 * np.array([spent[name] for spent in seconds]) for name in TIMED}
     for name, values in columns.items():
         columns[name] = tuple(values) if name in ("source", "status", "given_way") else np.array(values)
     columns["timing_ms"] = {**timing, "total": np.sum(list(timing.values()), axis=0)}
