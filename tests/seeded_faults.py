@@ -182,7 +182,7 @@ FAULTS = (
     ),
     fault(
         "estimate", "the covariance forgets the noise of the measurement that it took",
-        "p = i_kc @ p @ i_kc.T + self._noise_y[i] * np.outer(gain, gain)", "p = i_kc @ p @ i_kc.T",
+        "p = i_kc @ p @ i_kc.T + noise[i] * np.outer(gain, gain)", "p = i_kc @ p @ i_kc.T",
         "kalman",
     ),
     fault(

@@ -39,15 +39,17 @@ SCENARIO = hm.Scenario(
 )  # fmt: skip
 
 
+def saved(folder):
+    """The folder with an artifact of the tanks' prior."""
+    loop = loop_settings(SCENARIO, dict.fromkeys(("prior", "prior_observer"), (1e-5, 1e-5)))
+    programs, info = {"prior": prior_programs(Tanks(), DT)}, hm.model_info(Tanks(), DT)
+    hm.save_artifact(folder, programs, info, loop=loop, recommended="prior")
+    return folder
+
+
 @pytest.fixture(scope="module")
 def kit(tmp_path_factory):
-    folder, prior = tmp_path_factory.mktemp("tanks"), Tanks()
-    noise = dict.fromkeys(("prior", "prior_observer"), (1e-5, 1e-5))
-    hm.save_artifact(
-        folder, {"prior": prior_programs(prior, DT)}, hm.model_info(prior, DT), loop=loop_settings(SCENARIO, noise),
-        recommended="prior",
-    )  # fmt: skip
-    return hm.load(folder)
+    return hm.load(saved(tmp_path_factory.mktemp("tanks")))
 
 
 def test_the_artifact_says_all(kit):
@@ -163,11 +165,7 @@ LIMITS = hm.WatchLimits(
 
 
 def test_limits_of_residuals_are_kept_and_make_the_monitor(kit, tmp_path):
-    prior = Tanks()
-    hm.save_artifact(
-        tmp_path, {"prior": prior_programs(prior, DT)}, hm.model_info(prior, DT), loop=kit.loop,
-        recommended="prior",
-    )  # fmt: skip
+    saved(tmp_path)
     with pytest.raises(hm.InputError, match=r"'hybrid'.*prior.*HM-KIT-034"):
         set_limits(tmp_path, {"hybrid": [LIMITS]})
     set_limits(tmp_path, {"prior": [LIMITS]})
@@ -214,15 +212,7 @@ def test_recordings_are_watched_by_their_channels(kit, tmp_path):
             rows.append((DT * k, u, y, w))
             x = plant.step(x, np.array([u]), DT, np.array([w]))
         np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header="t,pump,lower,inflow", comments="")
-    folder = tmp_path / "model"
-    prior = Tanks()
-    hm.save_artifact(
-        folder,
-        {"prior": prior_programs(prior, DT)},
-        hm.model_info(prior, DT),
-        loop=kit.loop,
-        recommended="prior",
-    )
+    folder = saved(tmp_path / "model")
     job = monitor_job.prepared(SCENARIO, folder, [tmp_path / "calm.csv"])
     limits = monitor_job.learn(job, 1.0, tmp_path)
     job = monitor_job.prepared(

@@ -44,7 +44,7 @@ FORCE = hm.ChannelLimit("force of phi", "N m", 0, 4.0, 2.0, (1e-4, 1e-4, 0.0, 1e
 LIMITS = hm.WatchLimits("energy", 0.02, (FORCE,), (0.01,), (0,), 1.0, 0.1, "by hand", rest_speed=(0.2,))
 WATCHED = "watch/hybrid.json"
 WRITERS = {
-    "export": ("save_models", "write_description"), "noise": ("write_observer",), "tasks": ("write_tasks",),
+    "export": ("save_artifact", "write_description"), "noise": ("write_observer",), "tasks": ("write_tasks",),
     "watch": ("write_watch",), "promises": ("write_promises",),
 }  # fmt: skip
 """Functions that write a kit's files, by the stage that may call them."""

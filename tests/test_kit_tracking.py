@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_kit_any_machine import DT, OCP, SCENARIO, Tanks
+from test_kit_any_machine import DT, OCP, SCENARIO, Tanks, saved
 
 import hybrid_mpc as hm
 from hybrid_mpc.embedded.export import write_controller
 from hybrid_mpc.estimate.tracking import DAY, TrackedParameter
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.kit.artifact import build_model
-from hybrid_mpc.kit.parts import WatchFile, loop_settings, save_loop
+from hybrid_mpc.kit.parts import WatchFile, save_loop
 
 LIMITS = hm.WatchLimits(
     "residuals", DT, (hm.ChannelLimit("lower", "m", 1, 2e-3, 1e-3),), (np.inf,), (0,),
@@ -24,13 +24,7 @@ TRACKED = (TrackedParameter("k", 0.2, relative=True),)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    place, prior = tmp_path_factory.mktemp("tanks"), Tanks()
-    noise = dict.fromkeys(("prior", "prior_observer"), (1e-5, 1e-5))
-    hm.save_artifact(
-        place, {"prior": prior_programs(prior, DT)}, hm.model_info(prior, DT), loop=loop_settings(SCENARIO, noise),
-        recommended="prior",
-    )  # fmt: skip
-    return place
+    return saved(tmp_path_factory.mktemp("tanks"))
 
 
 @pytest.fixture(scope="module")

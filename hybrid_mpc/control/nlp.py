@@ -153,37 +153,18 @@ class IpoptController(Controller):
         return max(float(np.max(beyond, initial=0.0)), float(np.max(outside))), kkt
 
     def _plan(
-        self,
-        u: Array,
-        z: Array,
-        target: Target,
-        cost: float,
-        status: Status,
-        kkt: float,
-        start: float,
-        i: int,
-    ) -> Solution:
+        self, u: Array, z: Array, target: Target, cost: float, status: Status, kkt: float, start: float, i: int
+    ) -> Solution:  # fmt: skip
         n_x, soft, d = self.ocp.n_x, self.problem.soft, target.d
         excess = soft.excess(soft.values(z[:, :n_x], u, target.e)) if len(soft) else np.zeros(0)
         after = self._step(z[:-1].T, self.model.acting(u, d, target.w).T).full().T
         defect = float(np.max(np.abs(after - z[1:])))
         spent = {"solve": (perf_counter() - start) * 1e3}
         return Solution(
-            u=u,
-            x=z[:, :n_x],
-            h=z[:, n_x:],
-            d=d,
-            cost=cost,
-            status=status,
-            kkt=kkt,
-            defect=defect,
-            timing=spent,
-            excess=soft.largest(excess),
-            iterations=i,
-            w=target.w,
-            steady=target.steady,
+            u=u, x=z[:, :n_x], h=z[:, n_x:], d=d, cost=cost, status=status, kkt=kkt, defect=defect,
+            timing=spent, excess=soft.largest(excess), iterations=i, w=target.w, steady=target.steady,
             given_way=soft.given_way(excess),
-        )
+        )  # fmt: skip
 
     def _formulate(self) -> dict[str, ca.MX]:
         """Problem of ``nlpsol`` over ``(u, z, slacks)``; keeps the bounds of its unknowns and rows."""

@@ -23,7 +23,7 @@ from hybrid_mpc.control.soft import (
     tightest,
 )
 from hybrid_mpc.errors import Collected, InputError
-from hybrid_mpc.model.limits import input_limits, numbers, vector
+from hybrid_mpc.model.limits import check_flag, input_limits, numbers, vector, whole
 from hybrid_mpc.model.model import output_with_jacobian
 from hybrid_mpc.model.riccati import dare, linearization, remedy_for_unmoved, unmoved_states
 from hybrid_mpc.records import known
@@ -197,11 +197,11 @@ class OCP:
         preview_w: bool = False,
     ) -> None:
         own = Collected()
-        n = own(_horizon, horizon)
+        n = own(whole, horizon, "horizon [periods]", 1, MOST_HORIZON)
         q_v, r_v = own(_diagonal, q, "q"), own(_diagonal, r, "r")
         n_x, n_u = (None if v is None else v.size for v in (q_v, r_v))
         soft_b, hard_b = own(_bounds, soft, SoftBound, "soft"), own(_bounds, hard, HardBound, "hard")
-        flags = [own(_flag, v, name) for v, name in ((preview, "preview"), (preview_w, "preview_w"))]
+        flags = [own(check_flag, v, name) for v, name in ((preview, "preview"), (preview_w, "preview_w"))]
         outputs = own(_weights, q_y, "q_y")
         fields: dict[str, Any] = {
             "horizon": n, "q": q_v, "r": r_v, "economic": own(_stage_cost, economic), "q_y": outputs,
@@ -434,28 +434,8 @@ class OCP:
         return a, b, q, np.diag(self.r + self.r_delta) * model.dt
 
 
-def _horizon(value: object) -> int:
-    """A number of periods."""
-    if not _whole(value) or not 1 <= value <= MOST_HORIZON:  # type: ignore[operator]
-        raise InputError(
-            f"horizon: must be an integer from 1 to {MOST_HORIZON} periods, got {value!r:.80} [HM-CONTROL-011]"
-        )
-    return int(value)  # type: ignore[call-overload]
-
-
-def _flag(value: object, name: str) -> bool:
-    if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name}: must be True or False, got {value!r:.80} [HM-CONTROL-012]")
-    return bool(value)
-
-
 def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:
-    """Soft or hard bounds, as a tuple."""
-    example = (
-        "SoftBound(expression, lower, upper, ...)"
-        if kind is SoftBound
-        else "HardBound(what, lower, upper, ...)"
-    )
+    example = f"{kind.__name__}({'expression' if kind is SoftBound else 'what'}, lower, upper, ...)"
     if not isinstance(given, tuple | list):
         raise InputError(f"{name}: must be a list of {example}, got {given!r:.80} [HM-CONTROL-013]")
     if wrong := [bound for bound in given if not isinstance(bound, kind)]:
@@ -464,7 +444,6 @@ def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:
 
 
 def _check_hard(hard: Sequence[HardBound], n_x: int, n_y: int) -> None:
-    """Refuse hard bounds whose size differs from that of states or outputs."""
     for bound in hard:
         needed = {"x": n_x, "y": n_y}.get(bound.what if isinstance(bound.what, str) else "", 0)
         if needed and bound.lower.size != needed:
@@ -503,7 +482,6 @@ def _largest_change(value: ArrayLike, n_u: int) -> Array:
 
 
 def _plans(starts: object, horizon: int, n_u: int) -> tuple[Array, ...]:
-    """Input plans, as a tuple."""
     if not isinstance(starts, tuple | list | np.ndarray):
         raise InputError(f"starts: must be a list of input plans, got {starts!r:.80} [HM-CONTROL-019]")
     for i, plan in enumerate(starts):
@@ -515,15 +493,6 @@ def _parametric(soft: Sequence[SoftBound], hard: Sequence[HardBound]) -> list[ca
     """Bounded expressions with parameters."""
     given = [bound.expression for bound in soft] + [b.what for b in hard if not isinstance(b.what, str)]
     return [f for f in given if f.n_in() > 3]
-
-
-def _whole(value: object) -> bool:
-    return (
-        isinstance(value, int | float | np.number)
-        and not isinstance(value, bool | complex | np.complexfloating)
-        and (isinstance(value, int) or bool(np.isfinite(value)))
-        and int(value) == value
-    )
 
 
 def _diagonal(values: ArrayLike, name: str) -> Array:
@@ -540,7 +509,6 @@ def _diagonal(values: ArrayLike, name: str) -> Array:
 
 
 def _weights(values: ArrayLike, name: str) -> Array:
-    """Weights, finite and not negative."""
     array = numbers(values, name, most=LARGEST)
     if not (np.all(np.isfinite(array)) and np.all(array >= 0)):
         raise InputError(f"{name}: weights must be finite and not negative, got {array} [HM-CONTROL-022]")
@@ -570,7 +538,6 @@ def input_plan(value: ArrayLike, horizon: int, n_u: int, name: str) -> Array:
 
 
 def _point(value: object, n_x: int, n_u: int) -> tuple[Array, Array]:
-    """A finite state ``(n_x,)`` and input ``(n_u,)``."""
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise InputError(
             f"working_point: must be (x, u), a state and an input, got {value!r} [HM-CONTROL-025]"
@@ -594,8 +561,8 @@ def _is_stage_cost(f: object) -> bool:
 def _block_lengths(blocks: object, horizon: int) -> tuple[int, ...]:
     """Lengths of move blocks that fit the horizon."""
     given = tuple(blocks) if isinstance(blocks, tuple | list | np.ndarray) else ()
-    lengths = tuple(int(length) for length in given if _whole(length))
-    if not given or len(lengths) < len(given) or min(lengths) < 1 or sum(lengths) != horizon:
+    lengths = tuple(whole(length, "blocks: a length [periods]", 1, horizon) for length in given)
+    if sum(lengths) != horizon:
         raise InputError(
             f"blocks: must be positive integers that sum to the horizon of {horizon}, got {blocks!r:.80}"
             " [HM-CONTROL-026]"

@@ -293,7 +293,7 @@ class _Bounded:
 def _bounded(ocp: OCP, model: HybridModel, sizes: Sizes) -> list[_Bounded]:
     """All bounds of a problem except those of its inputs; states first."""
     y_names = tuple(f"output {s.name}" for s in model.outputs)
-    none = np.zeros(0, dtype=np.int64)
+    no_states = np.zeros(0, dtype=np.int64)
 
     def states(*rows: Array) -> _Bounded:
         chosen = np.flatnonzero(np.isfinite(rows[0]) | np.isfinite(rows[1]))
@@ -302,10 +302,10 @@ def _bounded(ocp: OCP, model: HybridModel, sizes: Sizes) -> list[_Bounded]:
     def values(f: ca.Function, name: str, *rows: Array) -> _Bounded:
         n = rows[0].size
         names = (name,) if n == 1 else tuple(f"{name}[{i}]" for i in range(n))
-        return _Bounded(f, none, np.array(rows), names)
+        return _Bounded(f, no_states, np.array(rows), names)
 
     def outputs(*rows: Array) -> _Bounded:
-        return _Bounded(_outputs(model, ocp.n_p), none, np.array(rows), y_names)
+        return _Bounded(_outputs(model, ocp.n_p), no_states, np.array(rows), y_names)
 
     weights = _weights(ocp.q, ocp.x_min, ocp.x_max, sizes.states, sizes, "state")
     bounds = state_bounds(weights, ocp.x_min, ocp.x_max, ocp.slack_linear, ocp.slack_quadratic)
@@ -316,18 +316,9 @@ def _bounded(ocp: OCP, model: HybridModel, sizes: Sizes) -> list[_Bounded]:
     for bound in ocp.soft:
         f, name = _of_point(bound.expression, ocp, model), bound.expression.name()
         size = _violations(bound.lower, bound.upper, sizes.values(f), f"soft bound {name}", bound.linear > 0)
-        found.append(
-            values(
-                f,
-                name,
-                bound.lower,
-                bound.upper,
-                bound.linear,
-                bound.quadratic,
-                *np.zeros((2, bound.lower.size)),
-                size,
-            )
-        )
+        none = np.zeros((2, bound.lower.size))
+        rows = bound.lower, bound.upper, bound.linear, bound.quadratic, *none, size
+        found.append(values(f, name, *rows))
     if ocp.y_min.size:
         size = sizes.outputs
         weights = _weights(ocp.q_y, ocp.y_min, ocp.y_max, size, sizes, "output")
@@ -629,6 +620,12 @@ class Problem:
         """Bounds ``(n_x,)`` beyond which a plan diverges; infinite for periodic states and open ranges."""
         self.usable: tuple[Array, Array] = lower - USABLE * width, upper + USABLE * width
         """Bounds ``(n_x,)`` within which a free run is a first plan, likewise."""
+        followed, weight = (model.outputs, ocp.q_y) if ocp.n_y else (model.states, ocp.q)
+        pairs = zip(followed, weight.tolist(), strict=True)
+        names = [f"{s.name} [{s.unit}]" if q else f"{s.name} [{s.unit}], without weight" for s, q in pairs]
+        names += [f"parameter {i + 1} of cost and bounds" for i in range(ocp.n_p)]
+        self.reference_name = f"reference ({'outputs' if ocp.n_y else 'states'}: {'; '.join(names)})"
+        """Name of a reference with its columns in their order, for messages."""
 
     def diverges(self, x: Array) -> bool:
         """True if states ``(n, n_x)`` lie further outside of their declared ranges than :data:`BEYOND` widths."""
@@ -652,17 +649,9 @@ class Problem:
         x, h = z[:, : ocp.n_x], z[:, ocp.n_x :]
         nan = float("nan")
         return Solution(
-            u=plan,
-            x=x,
-            h=h,
-            d=estimate.d,
-            cost=nan,
-            status=Status.INITIAL,
-            kkt=nan,
-            defect=nan,
-            timing={},
+            u=plan, x=x, h=h, d=estimate.d, cost=nan, status=Status.INITIAL, kkt=nan, defect=nan, timing={},
             w=w,
-        )
+        )  # fmt: skip
 
     def target(
         self, reference: ArrayLike, weight: ArrayLike | None = None, estimate: Estimate | None = None,
@@ -678,7 +667,7 @@ class Problem:
             start: Steady state from which those of an outputs' reference are searched.
         """
         n, m, ocp = self.ocp.horizon, self.model, self.ocp
-        rows = self._preview(reference, "reference", ocp.columns)
+        rows = self._preview(reference, self.reference_name, ocp.columns)
         p, weights = rows[:, ocp.columns - ocp.n_p :], self.weights(weight)
         d = np.zeros(m.n_d) if estimate is None else estimate.d
         ahead = self.forecast(w, estimate)

@@ -257,15 +257,9 @@ class CondensedController(SplitController):
         target = self.problem.target(reference, prepared.weight, estimate, w, prepared.steady)
         if target.w is not prepared.w and not np.array_equal(target.w, prepared.w):
             prepared = self.linearize(
-                prepared.u,
-                prepared.z,
-                prepared.d,
-                prepared.u_prev,
-                prepared.weight,
-                target.w,
-                prepared.steady,
+                prepared.u, prepared.z, prepared.d, prepared.u_prev, prepared.weight, target.w, prepared.steady,
                 prepared.active,
-            )
+            )  # fmt: skip
         hessian, economic = self._at_parameters(prepared, target)
         n_x = self._n_x
         dz0 = np.concatenate([estimate.x, estimate.h]) - prepared.z[0]
@@ -303,21 +297,10 @@ class CondensedController(SplitController):
         lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
         u = np.minimum(np.maximum(u, lower), upper)  # the QP only keeps them within its tolerance
         return Solution(
-            u=u,
-            x=z[:, :n_x],
-            h=z[:, n_x:],
-            d=estimate.d,
-            cost=cost,
-            status=answer.status,
-            kkt=answer.kkt,
-            defect=_largest(prepared.defects),
-            timing=self._timing(prepared, start),
-            excess=largest,
-            w=target.w,
-            steady=target.steady,
-            active=answer.active,
-            given_way=given_way,
-        )
+            u=u, x=z[:, :n_x], h=z[:, n_x:], d=estimate.d, cost=cost, status=answer.status, kkt=answer.kkt,
+            defect=_largest(prepared.defects), timing=self._timing(prepared, start), excess=largest, w=target.w,
+            steady=target.steady, active=answer.active, given_way=given_way,
+        )  # fmt: skip
 
     def solve(
         self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
@@ -439,19 +422,9 @@ class CondensedController(SplitController):
         x, h = prepared.z[:, : self._n_x], prepared.z[:, self._n_x :]
         defect, spent = _largest(prepared.defects), self._timing(prepared, start)
         return Solution(
-            u=prepared.u,
-            x=x,
-            h=h,
-            d=prepared.d,
-            cost=NAN,
-            status=status,
-            kkt=kkt,
-            defect=defect,
-            timing=spent,
-            excess=NAN,
-            w=prepared.w,
-            steady=prepared.steady,
-        )
+            u=prepared.u, x=x, h=h, d=prepared.d, cost=NAN, status=status, kkt=kkt, defect=defect, timing=spent,
+            excess=NAN, w=prepared.w, steady=prepared.steady,
+        )  # fmt: skip
 
     def _timing(self, prepared: Prepared, start: float) -> dict[str, float]:
         return {"prepare": prepared.milliseconds, "feedback": (perf_counter() - start) * 1e3}

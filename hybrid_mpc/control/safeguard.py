@@ -235,7 +235,6 @@ class SafeController:
 
 
 def _ahead(w: Array | None) -> dict[str, Any]:
-    """The forecast as a keyword argument, if there is one."""
     return {} if w is None else {"w": w}
 
 

@@ -160,13 +160,8 @@ class HardBound:
         own.refuse()
         assert ends is not None
         low, up = ends
-        for name, value in (
-            ("what", what),
-            ("lower", fixed(low)),
-            ("upper", fixed(up)),
-            ("priority", priority),
-            ("at_end", at_end),
-        ):
+        values = what, fixed(low), fixed(up), priority, at_end
+        for name, value in zip(self.__dataclass_fields__, values, strict=True):
             object.__setattr__(self, name, value)
 
     def __eq__(self, other: object) -> bool:

@@ -500,20 +500,9 @@ class SQPController(Controller):
         excess = self.problem.soft.excess(at.soft[0])
         diverges = descent.status.ok and self.problem.diverges(at.z[1:, :n_x])
         return Solution(
-            u=at.u,
-            x=at.z[:, :n_x],
-            h=at.z[:, n_x:],
-            d=case.d,
-            cost=at.cost,
-            status=Status.DIVERGED if diverges else descent.status,
-            kkt=descent.kkt,
-            defect=0.0,
-            timing={"solve": (perf_counter() - start) * 1e3},
-            excess=self.problem.soft.largest(excess),
-            iterations=descent.count,
-            curvature=descent.curvature,
-            w=case.target.w,
-            steady=case.target.steady,
-            active=descent.active,
-            given_way=self.problem.soft.given_way(excess),
-        )
+            u=at.u, x=at.z[:, :n_x], h=at.z[:, n_x:], d=case.d, cost=at.cost,
+            status=Status.DIVERGED if diverges else descent.status, kkt=descent.kkt, defect=0.0,
+            timing={"solve": (perf_counter() - start) * 1e3}, excess=self.problem.soft.largest(excess),
+            iterations=descent.count, curvature=descent.curvature, w=case.target.w, steady=case.target.steady,
+            active=descent.active, given_way=self.problem.soft.given_way(excess),
+        )  # fmt: skip

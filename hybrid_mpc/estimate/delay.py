@@ -102,17 +102,7 @@ class DelayCompensation:
         for u in inputs:
             now = self.estimator.predict(now, u)
         return DelayedEstimate(
-            t=now.t,
-            x=now.x,
-            h=now.h,
-            d=now.d,
-            P=now.P,
-            innovation=base.innovation,
-            nis=base.nis,
-            filtered=base,
-            inputs=inputs,
-            missing=missing,
-            w=now.w,
+            now.t, now.x, now.h, now.d, now.P, base.innovation, base.nis, base, inputs, missing, w=now.w
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, Required, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,6 +76,18 @@ class Estimator(Protocol):
         self, estimate: Estimate, y: ArrayLike, u_prev: ArrayLike, *, w: ArrayLike | None = None
     ) -> Estimate:
         """Estimate one period later, from ``y`` and the input held since."""
+
+
+class Sigmas(TypedDict, total=False):
+    """Standard deviations of a filter: the arguments of :class:`ExtendedKalmanFilter`."""
+
+    sigma_y: Required[ArrayLike]
+    sigma_x: Required[ArrayLike]
+    sigma_x0: Required[ArrayLike]
+    sigma_d: ArrayLike | None
+    sigma_d0: ArrayLike | None
+    sigma_h: ArrayLike | None
+    sigma_h0: ArrayLike | None
 
 
 class ExtendedKalmanFilter:
@@ -155,7 +167,6 @@ class ExtendedKalmanFilter:
         self._first = np.concatenate(
             [_variance(sigma_x0, n_x, "sigma_x0"), hidden0, _variance(sigma_d0, n_d, "sigma_d0")]
         )
-        assert model.with_jacobian is not None
         self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
         self._step.inputs[4][:] = model.p
         self._lost = self._most_known()
@@ -276,16 +287,21 @@ class ExtendedKalmanFilter:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
     def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
         """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
+        z, p = self._following(estimate, u)
+        p.flat[:: p.shape[0] + 1] += self._noise
+        empty, w = np.full(self.model.n_y, np.nan), self.known_w(estimate, None)
+        return Estimate(estimate.t + self.model.dt, *self._parts(z), p, empty, float("nan"), w=w)
+
+    def _following(self, estimate: Estimate, u: ArrayLike) -> tuple[Array, Array]:
+        """The next ``(x, h, d)`` ``(n,)``, and its covariance without process noise."""
         f = self._transition(estimate, u)
         x, h, *_ = self._step.outputs  # of the next call
-        p = f @ estimate.P @ f.T
-        p.flat[:: p.shape[0] + 1] += self._noise
-        empty, t, w = (
-            np.full(self.model.n_y, np.nan),
-            estimate.t + self.model.dt,
-            self.known_w(estimate, None),
-        )
-        return Estimate(t, x + self._on_x @ estimate.d, h.copy(), estimate.d, p, empty, float("nan"), w=w)
+        return np.concatenate([x + self._on_x @ estimate.d, h, estimate.d]), f @ estimate.P @ f.T
+
+    def _parts(self, z: Array) -> tuple[Array, Array, Array]:
+        """``x``, ``h`` and ``d`` of a vector ``(x, h, d)``."""
+        n_x, n_z = self._sizes[0], self._sizes[0] + self._sizes[1]
+        return z[:n_x], z[n_x:n_z], z[n_z:]
 
     def tangent(self, estimate: Estimate, u: ArrayLike) -> tuple[Array, Array]:
         """Jacobians of the next ``(x, h, d)`` ``(n, n)`` and of the output ``(n_y, n)`` by ``(x, h, d)``."""
@@ -319,20 +335,24 @@ class ExtendedKalmanFilter:
 
         Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
         """
-        n_x, n_h, _, _ = self._sizes
         y = sampled(y, (self.model.n_y,), "y")
         seen = np.isfinite(y)
         if not seen.any():
             return estimate, 0.0
+        innovation, step, p, nis, size = self._corrected(estimate, y, u, seen)
+        x, h, d = self._parts(step)
+        now = estimate.t, estimate.x + x, estimate.h + h, estimate.d + d
+        return Estimate(*now, p, innovation, nis, w=estimate.w), -0.5 * (nis + size)
+
+    def _corrected(
+        self, estimate: Estimate, y: Array, u: ArrayLike | None, seen: NDArray[np.bool_]
+    ) -> tuple[Array, Array, Array, float, float]:
+        """Innovation by the outputs that are ``seen``, and the results of :func:`absorbed`."""
         y_hat, c = self._predicted(estimate, u)
         innovation = np.where(seen, self.nearest(y, y_hat) - y_hat, np.nan)
-        step, p, nis, size = absorbed(estimate.P, c, innovation, self._noise_y, seen)
-        n_z = n_x + n_h
-        x, h, d = estimate.x + step[:n_x], estimate.h + step[n_x:n_z], estimate.d + step[n_z:]
-        after = Estimate(estimate.t, x, h, d, p, innovation, nis, w=estimate.w)
-        return after, -0.5 * (nis + size)
+        return innovation, *absorbed(estimate.P, c, innovation, self._noise_y, seen)
 
-    def same_on(self, model: HybridModel, **sigmas: Array) -> ExtendedKalmanFilter:
+    def same_on(self, model: HybridModel, **sigmas: Unpack[Sigmas]) -> ExtendedKalmanFilter:
         """A filter of the same kind on another model with the same states and outputs.
 
         ``sigmas`` are the arguments of the constructor.

@@ -34,13 +34,13 @@ space of the measurements; Huber, *Robust estimation of a location parameter*, A
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, absorbed
+from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, Sigmas, absorbed
 from hybrid_mpc.estimate.roots import root
 from hybrid_mpc.model.active_set import Active, ActiveSet, RowQP
 from hybrid_mpc.model.buffered import BufferedFunction
@@ -118,13 +118,6 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
     Args:
         model: The deployed model. Tracked parameters are states of it
             (:class:`~hybrid_mpc.estimate.tracking.TrackingFilter`).
-        sigma_y: As for :class:`ExtendedKalmanFilter`, like the following.
-        sigma_x: See there.
-        sigma_x0: See there.
-        sigma_d: See there.
-        sigma_d0: See there.
-        sigma_h: See there.
-        sigma_h0: See there.
         periods: Longest window [periods]. Default: 20.
         lower: Lower bounds ``(n_x,)`` of the states; ``-inf`` for none. Default: the signals' ranges, except those of
             periodic signals.
@@ -135,6 +128,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         jump: Step of a disturbance per period, in standard deviations, from which the loss is linear; ``inf``: a jump
             is as improbable as its standard deviation says. Default: 3.
         iterations: Most Gauss-Newton steps per sample. Default: 1, the real-time iteration.
+        **sigmas: Standard deviations ``sigma_y`` to ``sigma_h0``, as for :class:`ExtendedKalmanFilter`.
 
     Raises:
         InputError: As :class:`ExtendedKalmanFilter`; if a lower bound is not below its upper bound, ``huber`` or
@@ -155,24 +149,15 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         self,
         model: HybridModel,
         *,
-        sigma_y: ArrayLike,
-        sigma_x: ArrayLike,
-        sigma_x0: ArrayLike,
-        sigma_d: ArrayLike | None = None,
-        sigma_d0: ArrayLike | None = None,
-        sigma_h: ArrayLike | None = None,
-        sigma_h0: ArrayLike | None = None,
         periods: int = 20,
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
         huber: float = HUBER,
         jump: float = JUMP,
         iterations: int = 1,
+        **sigmas: Unpack[Sigmas],
     ) -> None:
-        super().__init__(
-            model, sigma_y=sigma_y, sigma_x=sigma_x, sigma_x0=sigma_x0, sigma_d=sigma_d, sigma_d0=sigma_d0,
-            sigma_h=sigma_h, sigma_h0=sigma_h0,
-        )  # fmt: skip
+        super().__init__(model, **sigmas)
         self.periods = whole(periods, "periods", 1, MOST_PERIODS)
         self.iterations = whole(iterations, "iterations", 1, MOST_ITERATIONS)
         self.huber, self.jump = (
@@ -189,7 +174,7 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         self._stages = stages(model, self.periods)
         self._outputs = BufferedFunction(output_with_jacobian(model).map(self.periods))
 
-    def same_on(self, model: HybridModel, **sigmas: Array) -> MovingHorizonEstimator:
+    def same_on(self, model: HybridModel, **sigmas: Unpack[Sigmas]) -> MovingHorizonEstimator:
         """See :meth:`ExtendedKalmanFilter.same_on`; window, bounds and loss are the same."""
         return MovingHorizonEstimator(
             model, periods=self.periods, lower=self.lower, upper=self.upper, huber=self.huber, jump=self.jump,
@@ -250,8 +235,8 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
         return first + step + p @ (c.T @ force), p
 
     def _at(self, own: WindowEstimate, z: Array, w: Array) -> WindowEstimate:
-        n_x, n_z = self._sizes[0], self._sizes[0] + self._sizes[1]
-        return replace(own, x=z[:n_x], h=z[n_x:n_z], d=z[n_z:], w=w)
+        x, h, d = self._parts(z)
+        return replace(own, x=x, h=h, d=d, w=w)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # without a solution it starts anew
     def assess(
@@ -435,7 +420,6 @@ class MovingHorizonEstimator(ExtendedKalmanFilter):
 
 
 def _and(rows: NDArray[Scalar], row: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Rows and another one."""
     return np.concatenate([rows, row[None]])
 
 

@@ -119,15 +119,7 @@ def offset_free(
     x = model.x0 if x is None else vector(x, model.n_x, "x")
     u = model.u0 if u is None else vector(u, model.n_u, "u")
     w = model.w if w is None else vector(w, model.n_w, "w")
-    h = hidden_fixed_point(model, x, u, w=w)
-    assert model.with_jacobian is not None
-    _, _, a, b = (m.full() for m in model.with_jacobian(x, h, u, w, model.p))
-    _, by_x, by_u = (m.full() for m in output_with_jacobian(model)(x, u, w))
-    on_u, on_x, on_y = model.disturbed
-    n_z = model.n_x + model.n_h
-    still, c = a - np.eye(n_z), np.hstack([by_x, np.zeros((model.n_y, model.n_h))])
-    b_d = b @ on_u
-    b_d[: model.n_x] += on_x
+    detects, still, b, c, by_u = steady_matrices(model, x, hidden_fixed_point(model, x, u, w=w), u, w)
     names = [signal.name for signal in model.outputs]
     wanted = list(range(model.n_y)) if controlled is None else list(controlled)
     chosen = [names.index(one) if one in names else one for one in wanted]
@@ -136,12 +128,24 @@ def offset_free(
             f"controlled: must be names or indices of the outputs {', '.join(names)}, got {wanted} [HM-ESTIMATE-010]"
         )
     rows = [int(i) for i in chosen]
-    target_rank, target_needed = _rank(np.block([[still, b], [c[rows], by_u[rows]]])), n_z + len(rows)
+    target_rank, n_z = _rank(np.block([[still, b], [c[rows], by_u[rows]]])), len(still)
     return OffsetFree(
-        model.n_d, model.n_y,
-        _rank(np.block([[still, b_d], [c, by_u @ on_u + on_y]])), n_z + model.n_d, target_rank, target_needed,
-        unmoved_states(model, a, b) if target_rank < target_needed else (),
+        model.n_d, model.n_y, _rank(detects), n_z + model.n_d, target_rank, n_z + len(rows),
+        unmoved_states(model, still + np.eye(n_z), b) if target_rank < n_z + len(rows) else (),
     )  # fmt: skip
+
+
+def steady_matrices(
+    model: HybridModel, x: Array, h: Array, u: Array, w: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """``[[A - I, B_d], [C, C_d]]``, ``A - I``, ``B``, ``C`` and ``D`` at a point, with ``z = (x, h)``."""
+    a, b = (m.full() for m in model.with_jacobian(x, h, u, w, model.p)[2:])
+    _, by_x, by_u = (m.full() for m in output_with_jacobian(model)(x, u, w))
+    on_u, on_x, on_y = model.disturbed
+    still, c = a - np.eye(len(a)), np.hstack([by_x, np.zeros((model.n_y, model.n_h))])
+    b_d = b @ on_u
+    b_d[: model.n_x] += on_x
+    return np.block([[still, b_d], [c, by_u @ on_u + on_y]]), still, b, c, by_u
 
 
 def distinguishable(model: HybridModel, sizes: ArrayLike | None = None) -> OffsetFree:

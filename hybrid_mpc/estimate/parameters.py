@@ -245,7 +245,6 @@ def _with_jacobian(model: HybridModel, change: ca.Function, n_g: int) -> ca.Func
     h = ca.MX.sym("h", model.n_h + n_g)
     own, theta = h[: model.n_h], h[model.n_h :]
     f, n_x, n_h = model.with_jacobian, model.n_x, model.n_h
-    assert f is not None
     x_next, h_next, a, b = inlined(f, [x, own, u, w, p])
     dx, slopes = change(0.5 * (x + x_next), theta, u, w, p)
     by_x, by_theta, by_u = ca.horzsplit(slopes, [0, n_x, n_x + n_g, slopes.size2()])

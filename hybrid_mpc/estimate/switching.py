@@ -131,7 +131,6 @@ class SwitchingFilter:
         self._noise, self._noise_y = (np.stack(one) for one in zip(*noises, strict=True))
         self._most = np.array([f.most for f in filters])
         self._unit = np.tile(np.eye(n_z + model.n_d), (m, 1, 1))
-        assert model.with_jacobian is not None
         self._step, self._output = (
             BufferedFunction(f.map(m)) for f in (model.with_jacobian, output_with_jacobian(model))
         )
@@ -162,9 +161,8 @@ class SwitchingFilter:
         after = joint.sum(axis=0)
         share = joint / np.where(after > 0, after, 1.0)
         share = np.where(share < NEGLIGIBLE, 0.0, share)
-        share = np.where(
-            after > 0, share / share.sum(axis=0), np.eye(m)
-        ).T  # of mode i in the past of mode j, (j, i)
+        # of mode i in the past of mode j, (j, i)
+        share = np.where(after > 0, share / share.sum(axis=0), np.eye(m)).T
         mean = share @ before.z
         off = before.z - mean[:, None]
         p = (share @ before.covariances.reshape(m, -1)).reshape(before.covariances.shape)
@@ -206,9 +204,8 @@ class SwitchingFilter:
         seen = np.isfinite(y)
         innovations = np.where(seen, y - y_hat, np.nan)
         step, nis, size = np.zeros(z.shape), np.zeros(len(z)), np.zeros(len(z))
-        for i in np.flatnonzero(
-            seen
-        ):  # sequential updates are exact, since the sensors' noises are independent
+        # sequential updates are exact, since the sensors' noises are independent
+        for i in np.flatnonzero(seen):
             row, noise = c[:, i], self._noise_y[:, i]
             pc = np.einsum("mij,mj->mi", p, row)
             s = np.sum(row * pc, axis=1) + noise

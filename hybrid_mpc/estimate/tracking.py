@@ -29,13 +29,14 @@ from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.model.limits import sampled
 from hybrid_mpc.model.model import (
-    Balance,
     HybridModel,
     ManyPoints,
     SideBySide,
+    at_arguments,
     inlined,
     step_function,
     step_symbols,
+    with_slopes,
 )
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Name, Positive
@@ -98,7 +99,7 @@ def tracked_values(model: HybridModel, tracked: Sequence[TrackedParameter], thet
     """Values ``(n_t,)`` [their units] of the tracked parameters for deviations ``theta`` ``(n_t,)``, within bounds."""
     found = []
     for one, t in zip(tracked, ca.vertsplit(theta), strict=True):
-        p = _parameter(model, one.name)
+        p = next(p for p in model.parameters if p.name == one.name)
         down, up = _room(p, one)
         saturated = up * ca.tanh(ca.fmax(t, 0) / up) + down * ca.tanh(ca.fmin(t, 0) / down)
         value = p.value * ca.exp(saturated) if one.relative else p.value + saturated
@@ -153,28 +154,12 @@ def with_tracked(model: HybridModel, tracked: Sequence[TrackedParameter]) -> Hyb
         >>> float(tracking.step(0.0, [], 1.0, [3.0], tracking.p)[0])
         3.0
     """
-    _check(model, tracked)
     n_w, places = model.n_w, _places(model, tracked)
     x, h, u, _, p = step_symbols(model)
     w = ca.MX.sym("w", n_w + len(places))
-    own, chosen = w[:n_w], _exchanged(p, places, w[n_w:])
-    point, given = [x, h, u, w, p], [x, h, u, own, chosen]
-    rate = ca.MX.sym("rate", model.n_x)
-    assert model.with_jacobian is not None
-    parameters = [_parameter(model, one.name) for one in tracked]
-    return replace(
-        model,
-        step=step_function("step", point, inlined(model.step, given)),
-        xdot=ca.Function("xdot", point, inlined(model.xdot, given), ["x", "h", "u", "w", "p"], ["xdot"]),
-        output=ca.Function(
-            "output", [x, u, w, p], inlined(model.output, [x, u, own, chosen]), ["x", "u", "w", "p"], ["y"]
-        ),
-        with_jacobian=step_function("with_jacobian", point, inlined(model.with_jacobian, given)),
-        balances=tuple(
-            Balance(b.name, b.unit, b.rate_unit, ca.Function(
-                "residual", [x, rate, u, w, p], inlined(b.residual, [x, rate, u, own, chosen])))
-            for b in model.balances
-        ),
+    parameters = [model.parameters[i] for i in places]
+    return at_arguments(
+        model, [x, h, u, w, p], [x, h, u, w[:n_w], _exchanged(p, places, w[n_w:])],
         side_by_side=None if model.side_by_side is None else _side_by_side(model.side_by_side, n_w, places),
         disturbances=(*model.disturbances, *(_signal(p) for p in parameters)),
         nominal_w=(*model.w.tolist(), *(p.value for p in parameters)),
@@ -186,7 +171,6 @@ def _signal(p: Parameter) -> Signal:
 
 
 def _exchanged(p: ca.MX, places: Sequence[int], values: ca.MX) -> ca.MX:
-    """Parameters of which some are exchanged."""
     every = ca.vertsplit(p)
     for i, value in zip(places, ca.vertsplit(values), strict=True):
         every[i] = value
@@ -219,7 +203,6 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
     Raises:
         InputError: If a parameter is unknown, or appears in the output equation.
     """
-    _check(model, tracked)
     places, n_h = _places(model, tracked), model.n_h
     x, _, u, w, p = step_symbols(model)
     shown = shown_parameters(model)
@@ -235,25 +218,18 @@ def tracking_model(model: HybridModel, tracked: Sequence[TrackedParameter]) -> H
     decay = ca.DM([one.decay(model.dt) for one in tracked])
     point = [x, h, u, w, p]
     x_next, h_next = inlined(model.step, [x, h[:n_h], u, w, chosen])
+    step = step_function("step", point, [x_next, ca.vertcat(h_next, decay * theta)])
     return replace(
         model,
-        step=step_function("step", point, [x_next, ca.vertcat(h_next, decay * theta)]),
+        step=step,
         xdot=ca.Function("xdot", point, [ca.densify(model.xdot(x, h[:n_h], u, w, chosen))]),
-        with_jacobian=None,
+        with_jacobian=with_slopes(step),
         side_by_side=None,
     )
 
 
 def _places(model: HybridModel, tracked: Sequence[TrackedParameter]) -> list[int]:
-    names = [p.name for p in model.parameters]
-    return [names.index(one.name) for one in tracked]
-
-
-def _parameter(model: HybridModel, name: str) -> Parameter:
-    return next(p for p in model.parameters if p.name == name)
-
-
-def _check(model: HybridModel, tracked: Sequence[TrackedParameter]) -> None:
+    """Indices of the tracked parameters among the model's."""
     names, known = [one.name for one in tracked], [p.name for p in model.parameters]
     if not names or len(set(names)) < len(names):
         raise InputError(
@@ -265,6 +241,7 @@ def _check(model: HybridModel, tracked: Sequence[TrackedParameter]) -> None:
                 f"tracked parameters: model {model.name} has no parameter {name!r}; known names: "
                 f"{', '.join(known) or 'none'} [HM-ESTIMATE-025]"
             )
+    return [known.index(name) for name in names]
 
 
 @dataclass(frozen=True)

@@ -198,9 +198,8 @@ def _error(ekf: ExtendedKalmanFilter, at: Estimate) -> Array | None:
     f, c = ekf.tangent(at, ekf.model.u0)
     noise, noise_y = ekf.noise
     try:
-        p, _ = dare(
-            f.T, c.T, np.diag(noise), np.diag(noise_y)
-        )  # of the prediction: the dual Riccati equation
+        # of the prediction: the dual Riccati equation
+        p, _ = dare(f.T, c.T, np.diag(noise), np.diag(noise_y))
     except InputError:
         return None
     gain = np.linalg.solve(c @ p @ c.T + np.diag(noise_y), c @ p).T

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
+from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter, Sigmas
 from hybrid_mpc.estimate.roots import root
 from hybrid_mpc.model.buffered import BufferedFunction
 from hybrid_mpc.model.limits import sampled
@@ -46,50 +46,24 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         array([1.2])
     """
 
-    def __init__(
-        self,
-        model: HybridModel,
-        *,
-        sigma_y: ArrayLike,
-        sigma_x: ArrayLike,
-        sigma_x0: ArrayLike,
-        sigma_d: ArrayLike | None = None,
-        sigma_d0: ArrayLike | None = None,
-        sigma_h: ArrayLike | None = None,
-        sigma_h0: ArrayLike | None = None,
-    ) -> None:
-        super().__init__(
-            model, sigma_y=sigma_y, sigma_x=sigma_x, sigma_x0=sigma_x0, sigma_d=sigma_d, sigma_d0=sigma_d0,
-            sigma_h=sigma_h, sigma_h0=sigma_h0,
-        )  # fmt: skip
+    def __init__(self, model: HybridModel, **sigmas: Unpack[Sigmas]) -> None:
+        super().__init__(model, **sigmas)
         many = 2 * self._noise.size
         self._steps = _many_steps(model, many)
         self._outputs = BufferedFunction(model.output.map(many))
         self._outputs.inputs[3].reshape(many, -1)[:] = model.p
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
-    def predict(self, estimate: Estimate, u: ArrayLike) -> Estimate:
-        """Estimate one period later with the input ``u`` ``(n_u,)`` held."""
-        (n_x, n_h, _, n_y), model = self._sizes, self.model
+    def _following(self, estimate: Estimate, u: ArrayLike) -> tuple[Array, Array]:
+        n_x, n_h, _, _ = self._sizes
         w, points = self.known_w(estimate, None), self._points(estimate)
         d = points[:, n_x + n_h :]
-        x, h = self._steps(points, sampled(u, (model.n_u,), "u") + d @ self._on_u.T, w)
+        x, h = self._steps(points, sampled(u, (self.model.n_u,), "u") + d @ self._on_u.T, w)
         mean, off = _spread(np.hstack([x + d @ self._on_x.T, h, d]))
-        p = off.T @ off
-        p.flat[:: p.shape[0] + 1] += self._noise
-        x, h, d = np.split(mean, [n_x, n_x + n_h])
-        empty = np.full(n_y, np.nan)
-        return Estimate(estimate.t + model.dt, x, h, d, p, empty, float("nan"), w=w)
+        return mean, off.T @ off
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # looked at in update
-    def assess(self, estimate: Estimate, y: ArrayLike, u: ArrayLike | None = None) -> tuple[Estimate, float]:
-        """Estimate after the measurement ``y`` ``(n_y,)``, and the log-likelihood of the measurement, without its
-        constant.
-        """
-        y = sampled(y, (self.model.n_y,), "y")
-        seen = np.isfinite(y)
-        if not seen.any():
-            return estimate, 0.0
+    def _corrected(
+        self, estimate: Estimate, y: Array, u: ArrayLike | None, seen: NDArray[np.bool_]
+    ) -> tuple[Array, Array, Array, float, float]:
         y_hat, of_z, of_y = self._shown(estimate, u)
         of_y, noise = of_y[:, seen], self._noise_y[seen]
         factor, _ = dpotrf(of_y.T @ of_y + np.diag(noise), 1)
@@ -98,15 +72,9 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         gain = dpotrs(factor, of_y.T @ of_z, 1)[0].T  # K = P_zy S^-1
         rest = of_z - of_y @ gain.T
         p = rest.T @ rest + (gain * noise) @ gain.T  # equal to P - K S K', and never indefinite
-        n_x, n_h, _, _ = self._sizes
-        x, h, d = np.split(gain @ e, [n_x, n_x + n_h])
         nis = float(e @ dpotrs(factor, e, 1)[0])
         size = 2 * float(np.sum(np.log(np.diag(factor))))
-        after = replace(
-            estimate, x=estimate.x + x, h=estimate.h + h, d=estimate.d + d, P=0.5 * (p + p.T),
-            innovation=innovation, nis=nis,
-        )  # fmt: skip
-        return after, -0.5 * (nis + size)
+        return innovation, gain @ e, 0.5 * (p + p.T), nis, size
 
     def innovation_covariance(self, estimate: Estimate, u: ArrayLike | None = None) -> Array:
         """Covariance ``(n_y, n_y)`` of a predicted estimate's innovation."""

@@ -101,8 +101,8 @@ def save_artifact(
     recommended: str = "",
     members: Sequence[Mapping[str, nn_export.Program]] = (),
     predicting: Predicting | None = None,
-) -> None:
-    """Write models, and the settings of loops with them, to ``folder``.
+) -> str:
+    """Write models, and the settings of loops with them, to ``folder``: ``models/`` and then ``kit.json``.
 
     Args:
         folder: Folder to write; it is made if missing.
@@ -116,35 +116,12 @@ def save_artifact(
         members: ``step`` and ``xdot`` of each network that the hybrid is the mean of, the best first. Default: none.
         predicting: Settings of predictions of recordings. Default: none, predictions are not possible.
 
+    Returns:
+        The hash of the programs.
+
     Raises:
         InputError: If an expression of a control problem cannot be written as a program.
     """
-    save_models(
-        folder,
-        programs,
-        info,
-        provenance=provenance,
-        recommended=recommended,
-        members=members,
-        predicting=predicting,
-    )
-    if loop is not None:
-        save_loop(folder, loop)
-    if limits is not None:
-        set_limits(folder, limits)
-
-
-def save_models(
-    folder: Path,
-    programs: Mapping[str, Mapping[str, nn_export.Program]],
-    info: ModelInfo,
-    *,
-    provenance: Provenance | None = None,
-    recommended: str = "",
-    members: Sequence[Mapping[str, nn_export.Program]] = (),
-    predicting: Predicting | None = None,
-) -> str:
-    """Write ``models/`` and then ``kit.json``, as :func:`save_artifact`; returns the hash of the programs."""
     flat = {f"{model}/{name}": p for model, functions in programs.items() for name, p in functions.items()}
     for name, own in zip(member_names(len(members)), members, strict=True):
         flat |= {f"{name}/{key}": own[key] for key in OWN}
@@ -157,6 +134,10 @@ def save_models(
             tuple(programs), hashed, info, provenance or Provenance(), recommended, len(members), predicting
         ),
     )
+    if loop is not None:
+        save_loop(folder, loop)
+    if limits is not None:
+        set_limits(folder, limits)
     return hashed
 
 
@@ -273,7 +254,6 @@ def load(folder: str | Path) -> Kit:
 
 
 def _named(name: object, what: str) -> str:
-    """The given name; InputError if it is not a text."""
     if not isinstance(name, str):
         raise InputError(f"{what}: give a name, got {type(name).__name__} [HM-KIT-004]")
     return name

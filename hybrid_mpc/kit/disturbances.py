@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
-from hybrid_mpc.estimate.offset_free import RANK, distinguishable, offset_free
+from hybrid_mpc.estimate.offset_free import RANK, distinguishable, offset_free, steady_matrices
 from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
@@ -156,22 +156,10 @@ def _errors(model: HybridModel, control: OCP) -> list[tuple[Array, Array]]:
     found = []
     for point in _rests(model, control):
         off = np.vstack([m.full()[:, free] for m in slopes(*point, model.p)]) * (OFF * np.abs(model.p[free]))
-        matrix = _at_rest(model, *point)
+        matrix = steady_matrices(model, *point, model.w)[0]
         if np.all(np.isfinite(matrix)) and np.all(np.isfinite(off)):
             found.append((matrix, off))
     return found
-
-
-def _at_rest(model: HybridModel, x: Array, h: Array, u: Array) -> Array:
-    """``[[A - I, B_d], [C, C_d]]`` at a point."""
-    assert model.with_jacobian is not None
-    a, b = (m.full() for m in model.with_jacobian(x, h, u, model.w, model.p)[2:])
-    _, by_x, by_u = (m.full() for m in output_with_jacobian(model)(x, u, model.w))
-    on_u, on_x, on_y = model.disturbed
-    b_d = b @ on_u
-    b_d[: model.n_x] += on_x
-    c = np.hstack([by_x, np.zeros((model.n_y, model.n_h))])
-    return np.block([[a - np.eye(len(a)), b_d], [c, by_u @ on_u + on_y]])
 
 
 def _rests(model: HybridModel, control: OCP) -> list[tuple[Array, Array, Array]]:

@@ -223,15 +223,11 @@ def loop_settings(
     problems = {"": scenario.control} | {task.name: task.control for task in scenario.tasks}
     safe = scenario.safe_input
     return LoopSettings(
-        {name: problem for name, problem in problems.items() if problem is not None},
-        scenario.sensor_sigma,
-        scenario.first_sigma,
-        dict(process_noise or {}),
-        dict(scenario.causes),
+        {name: problem for name, problem in problems.items() if problem is not None}, scenario.sensor_sigma,
+        scenario.first_sigma, dict(process_noise or {}), dict(scenario.causes),
         None if safe is None else tuple(numbers(safe, "safe_input").tolist()),
-        tuple(task.name for task in scenario.tasks),
-        scenario.disturbance_model,
-    )
+        tuple(task.name for task in scenario.tasks), scenario.disturbance_model,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -416,16 +412,8 @@ def watch_file(model: str) -> str:
 def save_loop(folder: Path, loop: LoopSettings) -> None:
     """Write settings of loops from a script: ``tasks.json``, ``tasks/``, ``observer.json``."""
     write_tasks(folder, loop)
-    write_observer(
-        folder,
-        ObserverSettings(
-            loop.sensor_sigma,
-            loop.first_sigma,
-            loop.process_noise,
-            loop.disturbance_model,
-            tracked=loop.tracked,
-        ),
-    )
+    sigmas = loop.sensor_sigma, loop.first_sigma, loop.process_noise
+    write_observer(folder, ObserverSettings(*sigmas, loop.disturbance_model, tracked=loop.tracked))
 
 
 def set_process_noise(folder: Path, noise: Mapping[str, ArrayLike]) -> None:
@@ -448,16 +436,11 @@ def set_limits(folder: Path, limits: Mapping[str, Sequence[WatchLimits]]) -> Non
         StorageError: If a file cannot be written.
     """
     _check_models(limits, read_description(folder))
-    write_watch(
-        folder,
-        {
-            model: WatchFile(
-                {one.kind: one for one in own},
-                rest_speed=next((one.rest_speed for one in own if one.rest_speed), ()),
-            )
-            for model, own in limits.items()
-        },
-    )
+    found = {}
+    for model, own in limits.items():
+        rest = next((one.rest_speed for one in own if one.rest_speed), ())
+        found[model] = WatchFile({one.kind: one for one in own}, rest_speed=rest)
+    write_watch(folder, found)
 
 
 def tuples(noise: Mapping[str, ArrayLike]) -> dict[str, tuple[float, ...]]:

@@ -31,7 +31,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
-from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held, n_tracked, with_unknown
+from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held, n_tracked, shortest_way, with_unknown
 from hybrid_mpc.machine.signals import nearest_turn as moved_by_turns
 from hybrid_mpc.model.limits import check_function, check_part, floats, sampled, whole
 from hybrid_mpc.model.model import HybridModel
@@ -190,6 +190,8 @@ class Loop:
             raise InputError(f"guard: give a Guard, got {type(guard).__name__} [HM-LOOP-018]")
         safe = controller if isinstance(controller, SafeController) else SafeController(controller)
         self.model, self.ocp = estimator.model, safe.controller.ocp
+        self.problem = safe.controller.problem
+        """Model and control problem, prepared."""
         _check_models(self.model, safe.controller.model)
         _check_monitor(monitor, self.model)
         if guard is not None and monitor is None:
@@ -198,15 +200,16 @@ class Loop:
         self._control = GuardedController(safe, guard)
         self._delay = whole_periods(input_delay, "input_delay")
         self._n_inputs = self._delay + whole_periods(sensor_delay, "sensor_delay") + 1
-        self._previews = Previews(reference, weight, self.ocp, self.model.dt, end, self.standing)
+        self._previews = Previews(reference, weight, self.problem, end)
         self._tracked = n_tracked(estimator)
         self._forecast = Forecast(w, self.ocp, self.n_measured, self.model.dt, self._tracked)
         self._truth, self._now = sees_truth(estimator), now
         followed = self.model.outputs if self.ocp.n_y else self.model.states
         self._turn_y = np.array([s.period for s in self.model.outputs])
         self._turns = bool(np.isfinite(self._turn_y).any())
-        turn = np.array([s.period if nearest_turn else math.inf for s in followed])
-        self._turn_ref = turn if np.isfinite(turn).any() else None
+        turn = np.array([s.period for s in followed])
+        self.turn: Array | None = turn if nearest_turn and np.isfinite(turn).any() else None
+        """Periods ``(n,)`` by whose multiples references are moved; None: they stay."""
         self._state: LoopState | None = None
         self._decide_late: Callable[[], tuple[Decision, GuardState]] | None = None
         self._ahead: _Ahead | None = None
@@ -454,7 +457,7 @@ class Loop:
     @property
     def standing(self) -> Array:
         """The operating point as reference ``(columns,)``: the default reference."""
-        return self._safe.controller.problem.standing()[0]
+        return self.problem.standing()[0]
 
     @property
     def safe_input(self) -> Array | None:
@@ -520,7 +523,7 @@ class Loop:
         else:
             x_ref, factors = self._previews((k + self._delay) * self.model.dt)
         if reference is not None:
-            x_ref = sampled(reference, (None, x_ref.shape[1]), "the reference")
+            x_ref = sampled(reference, (None, x_ref.shape[1]), self.problem.reference_name)
             if not len(x_ref):
                 raise InputError(
                     "reference: no rows; give a set-point, or a row for each period ahead [HM-LOOP-024]"
@@ -535,16 +538,9 @@ class Loop:
 
     def _near(self, x_ref: Array, estimate: Estimate, u: Array) -> Array:
         """The reference with periodic signals moved by whole periods, if the loop has ``nearest_turn``."""
-        if self._turn_ref is None:
+        if self.turn is None:
             return x_ref
-        now, n = self._outputs(estimate, u) if self.ocp.n_y else estimate.x, self._turn_ref.size
-        rows = np.vstack([now, x_ref[:, :n]])
-        # nearest to the row before: turns of all steps until then
-        with np.errstate(invalid="ignore"):
-            turns = np.nan_to_num(np.rint(np.diff(rows, axis=0) / self._turn_ref))
-        turns = np.cumsum(turns, axis=0)
-        moved = np.where(turns != 0, rows[1:] - turns * np.where(turns != 0, self._turn_ref, 0.0), rows[1:])
-        return np.hstack([moved, x_ref[:, n:]])
+        return shortest_way(x_ref, self._outputs(estimate, u) if self.ocp.n_y else estimate.x, self.turn)
 
     def _take_preparation(self, previous: Decision, weight: Array | None) -> Any:
         """The preparation of :meth:`finish`, if it belongs to this solve."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.control.ocp import OCP
+from hybrid_mpc.control.problem import Problem
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.limits import check_function, floats, sampled
 
@@ -20,24 +21,26 @@ class Previews:
     """Reference and weight factors over the horizon; the arguments are those of a ``Loop``.
 
     Without ``ocp.preview`` they are those of the present time only. Non-finite values beyond the ``end`` of the run [s]
-    are replaced by the last value before them. ``standing`` ``(columns,)`` is the default reference.
+    are replaced by the last value before them. The default reference is that of the operating point.
     """
 
     def __init__(
-        self, reference: Preview | ArrayLike | None, weight: Preview | None, ocp: OCP, dt: float, end: float,
-        standing: Array,
-    ) -> None:  # fmt: skip
+        self, reference: Preview | ArrayLike | None, weight: Preview | None, problem: Problem, end: float
+    ) -> None:
         if weight is not None:
             check_function(weight, "weight")
-        self._reference, self._weight = _function_of(reference, standing), weight
+        ocp, self._name = problem.ocp, problem.reference_name
+        self._reference, self._weight = _function_of(reference, problem), weight
         self._end = float(sampled(end, (), "end"))
         self._n_x, self._columns = ocp.n_x, ocp.columns
-        self._ahead: Array = np.arange(ocp.horizon + 1 if ocp.preview else 1, dtype=np.float64) * dt
+        self._ahead: Array = problem.model.dt * np.arange(
+            ocp.horizon + 1 if ocp.preview else 1, dtype=np.float64
+        )
 
     def __call__(self, t: float) -> tuple[Array, Array | None]:
         """Reference and factors (None for 1) from ``t`` on."""
         times = t + self._ahead
-        x_ref = self._evaluate(self._reference, times, "reference", self._columns)
+        x_ref = self._evaluate(self._reference, times, self._name, self._columns)
         weight = None if self._weight is None else self._evaluate(self._weight, times, "weight", self._n_x)
         return x_ref, weight
 
@@ -50,12 +53,8 @@ class Previews:
         beyond = (times > self._end + 1e-9) & ~np.all(np.isfinite(values), axis=1)
         if beyond.any():
             last = int(np.argmax(beyond)) - 1
-            ended = (
-                values[last]
-                if last >= 0
-                else floats(preview(np.array([self._end])), f"what {name} returns")[0]
-            )
-            values[beyond] = ended
+            at_end = values if last >= 0 else floats(preview(np.array([self._end])), f"what {name} returns")
+            values[beyond] = at_end[max(last, 0)]
         return values
 
 
@@ -109,10 +108,25 @@ def held(values: Array, first: Array) -> Array:
     return rows
 
 
-def _function_of(reference: Preview | ArrayLike | None, standing: Array) -> Preview:
+def shortest_way(reference: Array, now: Array, period: Array) -> Array:
+    """A reference ``(m, columns)`` whose first ``n`` columns are moved by whole periods ``(n,)``: the first row to the
+    nearest of ``now`` ``(n,)``, each later one to the nearest of the row before.
+    """
+    n = now.size
+    rows = np.vstack([np.where(np.isfinite(now), now, reference[0, :n]), reference[:, :n]])
+    # after a value that is not finite none is: no plan follows such a reference anyway
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i in np.flatnonzero(np.isfinite(period)):
+            rows[:, i] = np.unwrap(rows[:, i], period=period[i])
+    return np.hstack([rows[1:], reference[:, n:]])
+
+
+def _function_of(reference: Preview | ArrayLike | None, problem: Problem) -> Preview:
     """The reference as a function of time, from a function, a set-point, or None."""
     if callable(reference):
         check_function(reference, "reference")
         return reference
-    goal = standing if reference is None else sampled(reference, standing.shape, "the reference")
+    goal = problem.standing()[0]
+    if reference is not None:
+        goal = sampled(reference, goal.shape, problem.reference_name)
     return lambda t: np.tile(goal, (len(t), 1))

@@ -147,12 +147,8 @@ class Runner:
                 "[HM-LOOP-035]"
             )
         keep = whole(keep, "Runner: keep [periods]", 1, MOST_KEPT)
-        self._clock, self._dt, self._deadline, self._keep = (
-            RealClock() if clock is None else clock,
-            dt,
-            due,
-            keep,
-        )
+        self._clock = RealClock() if clock is None else clock
+        self._dt, self._deadline, self._keep = dt, due, keep
         self._measure, self._actuate, self._on_step = measure, actuate, on_step
         self._measure_w = measure_w
         self._loop = partial(
@@ -222,7 +218,6 @@ class Runner:
 
 
 def _read_answer(answer: object) -> bool:
-    """The answer of ``stop()`` as a bool."""
     try:
         return bool(answer)
     except ValueError as error:  # several numbers
@@ -269,16 +264,9 @@ class _Run:
         loop.finish()
         spent = {"measure": measured - begin, "actuate": acted - decided, **loop.spent}
         step = RunnerStep(
-            k=self.k,
-            t=self.k * self._dt,
-            y=loop.state.y,
-            estimate=loop.estimate,
-            decision=loop.decision,
-            reading=loop.reading,
-            lateness=begin - due,
-            applied=acted - due,
-            spent=spent,
-        )
+            k=self.k, t=self.k * self._dt, y=loop.state.y, estimate=loop.estimate, decision=loop.decision,
+            reading=loop.reading, lateness=begin - due, applied=acted - due, spent=spent,
+        )  # fmt: skip
         self._count(step)
         if self._runner._on_step is not None:
             self._runner._on_step(step)
@@ -498,10 +486,8 @@ class SafeEnd:
         if self._thread is threading.main_thread():
             for number in ENDING:
                 before = signal.getsignal(number)
-                if before not in (
-                    signal.SIG_IGN,
-                    None,
-                ):  # None: not a Python handler, so it could not be restored
+                # None: not a Python handler, so it could not be restored
+                if before not in (signal.SIG_IGN, None):
                     self._previous[number] = before
                     signal.signal(number, self._handler)
         else:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +22,7 @@ from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
 from hybrid_mpc.loop.plant import Plant, SimulatedMachine
-from hybrid_mpc.loop.preview import Preview, Previews, n_tracked
+from hybrid_mpc.loop.preview import Preview, Previews, n_tracked, shortest_way
 from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.limits import check_function, check_part, sampled, vector, whole
 from hybrid_mpc.model.model import HybridModel
@@ -62,6 +62,7 @@ def simulate(
     x0: ArrayLike,
     seed: int,
     weight: Preview | None = None,
+    nearest_turn: bool = False,
     w: Preview | ArrayLike | None = None,
     monitor: Monitor | None = None,
     faults: Sequence[Fault] = (),
@@ -96,6 +97,8 @@ def simulate(
         x0: Initial state ``(n_x,)``.
         seed: Seed of the plant and of the measurement noise.
         weight: Factors on ``q``, ``t (n,) -> (n, n_x)``, also previewed and part of the recorded cost. Default: 1.
+        nearest_turn: Whether references of periodic signals are moved by whole periods, as in
+            :class:`~hybrid_mpc.loop.loop.Loop`; record and cost have the moved ones. Default: False.
         w: Measured disturbances of the machine, ``t (n,) -> (n, n_w)`` or constant ones ``(n_w,)``: they act on the
             plant, the loop measures them, and previews them if the problem does. Default: those of the model's
             operating point.
@@ -131,15 +134,13 @@ def simulate(
     if not isinstance(faults, list | tuple) or not all(isinstance(fault, Fault) for fault in faults):
         raise InputError(f"faults: give a list of Fault, got {type(faults).__name__} [HM-LOOP-044]")
     seed = whole(seed, "seed", 0, 2**63 - 1)
-    sensor_delay, input_delay = (
-        whole_periods(sensor_delay, "sensor_delay"),
-        whole_periods(input_delay, "input_delay"),
-    )
+    sensor_delay = whole_periods(sensor_delay, "sensor_delay")
+    input_delay = whole_periods(input_delay, "input_delay")
     n_w = estimator.model.n_w - n_tracked(estimator)
     surroundings = _make_disturbances(w, estimator.model, n_w)
     loop = Loop(
-        estimator, controller, monitor=monitor, reference=reference, weight=weight, guard=guard,
-        w=surroundings, end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
+        estimator, controller, monitor=monitor, reference=reference, weight=weight, nearest_turn=nearest_turn,
+        guard=guard, w=surroundings, end=_end(dt, duration, estimator.model.dt), input_delay=input_delay,
         sensor_delay=sensor_delay, now=now,
     )  # fmt: skip
     ocp, model, periods = loop.ocp, loop.model, round(duration / dt)
@@ -148,21 +149,11 @@ def simulate(
     check_channels(faults, outputs, inputs)
     cost = _check_cost(ocp, ocp if stage_cost is None else stage_cost)
     # the loop's preview begins when its input will act, but the cost needs the present reference
-    standing = loop.standing
-    acting = Previews(reference, weight, ocp, dt, periods * dt, standing) if input_delay else None
-    rest = vector(x0, ocp.n_x, "x0")
+    acting = Previews(reference, weight, loop.problem, periods * dt) if input_delay else None
     machine = SimulatedMachine(
-        plant=plant,
-        x0=rest,
-        seed=seed,
-        outputs=outputs,
-        inputs=inputs,
-        faults=faults,
-        dt=dt,
-        sensor_delay=sensor_delay,
-        input_delay=input_delay,
+        plant, vector(x0, ocp.n_x, "x0"), seed, outputs, inputs, faults, dt, sensor_delay, input_delay
     )
-    rows: list[_Row] = []
+    rows: list[dict[str, Any]] = []
     for k in range(periods):
         t = k * dt
         x = sampled(plant.truth(machine.state), (ocp.n_x,), "the plant's truth")
@@ -181,13 +172,16 @@ def simulate(
         u, u_prev = machine.command(loop.decision.u)
         loop.finish()
         reference_now, factors = loop.previewed if acting is None else acting(t)
+        shown = model.output(x, u, known_w, model.p).full().ravel() if ocp.n_y or cost.n_y else x
+        if acting is not None and loop.turn is not None:
+            reference_now = shortest_way(reference_now, shown if ocp.n_y else x, loop.turn)
         goal = _goal(ocp, model, reference_now[0], loop.decision.solution.steady)
         with np.errstate(over="ignore", invalid="ignore"):  # a huge reference has an infinite cost
             weights = 1.0 if factors is None else factors[0]
-            error = model.output(x, u, known_w, model.p).full().ravel() - goal.y if cost.n_y else None
+            error = shown - goal.y if cost.n_y else None
             stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, weights, u_ref=goal.u, y_error=error))
         step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
-        rows.append(_row(step, goal, known_w, stage, loop.spent))
+        rows.append(_record(step, goal, known_w, stage, loop.spent))
         if on_step is not None:
             on_step(step)
         machine.advance(t, now_w if n_w else None)
@@ -234,78 +228,33 @@ def _in_time(late: Callable[[float], bool], t: float) -> bool:
     return not late(t)
 
 
-def _build_result(rows: Sequence[_Row], dt: float, switches: tuple[Switch, ...]) -> ClosedLoopResult:
-    readings = [row.reading for row in rows]
-    timing = {name: 1e3 * np.array([row.spent[name] for row in rows]) for name in TIMED}
-    return ClosedLoopResult(
-        dt=dt,
-        **{name: np.array([getattr(row, name) for row in rows]) for name in COLUMNS},
-        source=tuple(row.source for row in rows),
-        status=tuple(row.status for row in rows),
-        timing_ms={**timing, "total": np.sum(list(timing.values()), axis=0)},
-        violation=np.array([np.nan if r is None else r.violation_w for r in readings]),
-        share=np.array([np.nan if r is None else r.share for r in readings]),
-        alarm=np.array([r is not None and bool(r.alarm) for r in readings]),
-        valid=np.array([r is not None and not getattr(r, "validity", 0) for r in readings]),
-        switches=switches,
-        w=np.array([row.w for row in rows]),
-        y_ref=np.array([row.y_ref for row in rows]),
-        reached=np.array([row.reached for row in rows]),
-        given_way=tuple(row.given_way for row in rows),
-    )
+def _record(
+    step: Step, goal: _Goal, w: Array, stage_cost: float, spent: Mapping[str, float]
+) -> dict[str, Any]:
+    """A period of the result by field, without plans and covariances, which would need too much memory."""
+    e, d, reading = step.estimate, step.decision, step.reading
+    return {
+        "t": step.t, "x": step.x, "y": step.y, "u": d.u, "x_hat": e.x, "h": e.h, "d": e.d, "w": w,
+        "innovation": e.innovation, "nis": e.nis, "source": d.source.name, "status": d.status.name,
+        "reference": goal.x, "y_ref": goal.y, "reached": goal.reached, "stage_cost": stage_cost, "timing_ms": spent,
+        "violation": np.nan if reading is None else reading.violation_w,
+        "share": np.nan if reading is None else reading.share,
+        "alarm": reading is not None and bool(reading.alarm),
+        "valid": reading is not None and not getattr(reading, "validity", 0),
+        "given_way": d.solution.given_way,
+    }  # fmt: skip
 
 
-class _Row(NamedTuple):
-    """A period in the record, without plans and covariances, which would need too much memory."""
-
-    t: float
-    x: Array
-    y: Array
-    u: Array
-    x_hat: Array
-    h: Array
-    d: Array
-    reference: Array
-    stage_cost: float
-    innovation: Array
-    nis: float
-    source: str
-    status: str
-    reading: Reading | None
-    spent: Mapping[str, float]
-    w: Array
-    y_ref: Array
-    reached: bool
-    given_way: Mapping[str, float]
-
-
-COLUMNS = _Row._fields[:11]
-"""Numeric fields of a row."""
-
-
-def _row(step: Step, goal: _Goal, w: Array, stage: float, spent: Mapping[str, float]) -> _Row:
-    e, d = step.estimate, step.decision
-    return _Row(
-        t=step.t,
-        x=step.x,
-        y=step.y,
-        u=d.u,
-        x_hat=e.x,
-        h=e.h,
-        d=e.d,
-        reference=goal.x,
-        stage_cost=stage,
-        innovation=e.innovation,
-        nis=e.nis,
-        source=d.source.name,
-        status=d.status.name,
-        reading=step.reading,
-        spent=spent,
-        w=w,
-        y_ref=goal.y,
-        reached=goal.reached,
-        given_way=d.solution.given_way,
-    )
+def _build_result(
+    rows: Sequence[Mapping[str, Any]], dt: float, switches: tuple[Switch, ...]
+) -> ClosedLoopResult:
+    columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+    seconds = columns.pop("timing_ms")
+    timing = {name: 1e3 * np.array([spent[name] for spent in seconds]) for name in TIMED}
+    for name, values in columns.items():
+        columns[name] = tuple(values) if name in ("source", "status", "given_way") else np.array(values)
+    columns["timing_ms"] = {**timing, "total": np.sum(list(timing.values()), axis=0)}
+    return ClosedLoopResult(dt=dt, switches=switches, **columns)
 
 
 def _check_cost(ocp: OCP, cost: OCP) -> OCP:
@@ -477,13 +426,8 @@ def _label_columns(name: str, n: int, model: HybridModel | None) -> list[str]:
         return [f"{name}_{i}" for i in range(n)]
     if name == "d" and model.disturbance_model is not None:
         return [f"d {d.at} {d.signal}" for d in model.disturbance_model]
-    groups = {
-        "y": model.outputs,
-        "y_ref": model.outputs,
-        "u": model.inputs,
-        "d": model.inputs,
-        "w": model.disturbances,
-    }
+    outputs, inputs = model.outputs, model.inputs
+    groups = {"y": outputs, "y_ref": outputs, "u": inputs, "d": inputs, "w": model.disturbances}
     signals = groups.get(name, model.states)
     if len(signals) != n:
         raise InputError(

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import Parameter
-from hybrid_mpc.model.model import HybridModel, ManyPoints, SideBySide, inlined, step_function, step_symbols
+from hybrid_mpc.model.model import (
+    HybridModel,
+    ManyPoints,
+    SideBySide,
+    at_arguments,
+    inlined,
+    step_function,
+    step_symbols,
+)
 
 Array = NDArray[np.float64]
 BLEND_SHARE = Parameter("correction_share", 1.0, "-", 0.0, 2.0, "share of the network's correction")
@@ -51,13 +59,7 @@ def blended(prior: HybridModel, hybrid: HybridModel, share: float = BLEND_SHARE.
     p = ca.MX.sym("p", hybrid.n_p + 1)
     part, point = p[hybrid.n_p], [x, h, u, w, p]
     own = [x, h, u, w, p[: hybrid.n_p]]
-    queue = [
-        x,
-        h[: prior.n_h],
-        *own[2:],
-    ]  # the hidden state begins with the delayed inputs, the prior's has only them
-    assert prior.with_jacobian is not None
-    assert hybrid.with_jacobian is not None
+    queue = [x, h[: prior.n_h], *own[2:]]  # h begins with the delayed inputs, the prior's has only them
     base, full = inlined(prior.with_jacobian, queue), inlined(hybrid.with_jacobian, own)
     n_x, n_q = hybrid.n_x, hybrid.n_x + prior.n_h
     x_next = base[0] + part * (full[0] - base[0])
@@ -89,11 +91,8 @@ def with_share(model: HybridModel, share: float = BLEND_SHARE.value) -> HybridMo
             "[HM-MODEL-061]"
         )
     x, h, u, w, _ = step_symbols(model)
-    n_p, rate = model.n_p, ca.MX.sym("rate", model.n_x)
+    n_p, base = model.n_p, model.side_by_side
     p = ca.MX.sym("p", n_p + 1)
-    point, own = [x, h, u, w, p], [x, h, u, w, p[:n_p]]
-    assert model.with_jacobian is not None
-    base = model.side_by_side
 
     def make(n: int, by: Mapping[str, Sequence[str]]) -> ManyPoints:
         assert base is not None
@@ -103,20 +102,11 @@ def with_share(model: HybridModel, share: float = BLEND_SHARE.value) -> HybridMo
     covariance = np.zeros((n_p + 1, n_p + 1))
     if model.covariance:
         covariance[:n_p, :n_p] = model.covariance
-    return replace(
-        model,
-        step=step_function("step", point, inlined(model.step, own)),
-        xdot=ca.Function("xdot", point, inlined(model.xdot, own)),
-        output=ca.Function("output", [x, u, w, p], inlined(model.output, [x, u, w, p[:n_p]])),
-        with_jacobian=step_function("with_jacobian", point, inlined(model.with_jacobian, own)),
+    return at_arguments(
+        model, [x, h, u, w, p], [x, h, u, w, p[:n_p]],
         side_by_side=None if base is None else make,
         parameters=(*model.parameters, replace(BLEND_SHARE, value=share)),
         covariance=tuple(map(tuple, covariance.tolist())) if model.covariance else (),
-        balances=tuple(
-            replace(b, residual=ca.Function("residual", [x, rate, u, w, p],
-                                            inlined(b.residual, [x, rate, u, w, p[:n_p]])))
-            for b in model.balances
-        ),
     )  # fmt: skip
 
 

@@ -73,7 +73,6 @@ def with_input_delay(model: HybridModel, delay: float) -> HybridModel:
     h = ca.MX.sym("h", queue.size + model.n_h)
     inputs = ca.vertcat(h[: queue.size], u)
     own, acting, later = h[queue.size :], ca.sparsify(ca.DM(queue.share)) @ inputs, inputs[model.n_u :]
-    assert model.with_jacobian is not None
     x_next, h_next = inlined(model.step, [x, own, acting, w, p])
     x_slope, h_slope, a, b = inlined(model.with_jacobian, [x, own, acting, w, p])
     point, slopes = [x, h, u, w, p], queue.slopes(model.n_x, a, b)

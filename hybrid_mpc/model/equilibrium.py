@@ -94,23 +94,25 @@ class Equations(Protocol):
 
 
 class StepEquations:
-    """A model's step and outputs over ``v = (x, h, u)``; the disturbances ``d`` and ``w`` may be changed."""
+    """A model's step and outputs over ``v = (x, h, u)``; the disturbances ``d`` and ``w`` may be changed.
 
-    def __init__(self, model: HybridModel, w: ArrayLike | None = None) -> None:
-        assert model.with_jacobian is not None
+    ``rows`` are the indices of the states and hidden states that must be steady. Default: all.
+    """
+
+    def __init__(self, model: HybridModel, rows: Places | None = None) -> None:
         self.model = model
         self._step, self._output = map(BufferedFunction, (model.with_jacobian, output_with_jacobian(model)))
         self._step.inputs[4][:] = model.p
         self._on_u, self._on_x, self._on_y = model.disturbed
-        self._eye = np.eye(model.n_x + model.n_h)
+        self._eye, self._rows = np.eye(model.n_x + model.n_h), slice(None) if rows is None else rows
         self._hidden = np.zeros((model.n_y, model.n_h))
         self.d: Array = np.zeros(model.n_d)
         """Unmeasured disturbances ``(n_d,)``."""
-        self.w: Array = model.w if w is None else vector(w, model.n_w, "w")
+        self.w: Array = model.w
         """Measured disturbances ``(n_w,)``."""
 
     def rest(self, v: Array) -> tuple[Array, Array]:
-        """``F(z, u) - z`` and its Jacobian ``(n_z, n_z + n_u)``."""
+        """``F(z, u) - z`` of the rows that must be steady, and its Jacobian ``(n_e, n_z + n_u)``."""
         m, f, n_x = self.model, self._step, self.model.n_x
         n_z = len(self._eye)
         f.inputs[0][:], f.inputs[1][:] = v[:n_x], v[n_x:n_z]
@@ -118,7 +120,8 @@ class StepEquations:
         f()
         x, h, a, b = f.outputs
         moved = np.concatenate([x + self._on_x @ self.d, h]) - v[:n_z]
-        return moved, np.hstack([a.reshape(n_z, n_z).T - self._eye, b.reshape(m.n_u, n_z).T])
+        slopes = np.hstack([a.reshape(n_z, n_z).T - self._eye, b.reshape(m.n_u, n_z).T])
+        return moved[self._rows], slopes[self._rows]
 
     def shown(self, v: Array) -> tuple[Array, Array]:
         """Outputs and their Jacobian ``(n_y, n_z + n_u)``."""
@@ -485,18 +488,25 @@ def input_sizes(model: HybridModel) -> Array:
 
 
 def rest_search(
-    model: HybridModel, scale: Array | None = None, *, free: Places | None = None, steady: float = EXACT
-) -> SteadySearch:
+    model: HybridModel, scale: Array | None = None, *, rows: Places | None = None, free: Places | None = None,
+    settles: bool = True,
+) -> SteadySearch:  # fmt: skip
     """A search for steady states ``v = (x, h, u)`` without a set-point; ``scale`` ``(n_z,)`` are sizes of ``(x, h)``.
 
-    ``free`` are the indices of the free unknowns. Default: states and hidden states, at a constant input.
+    Args:
+        model: The model.
+        scale: Default: :func:`natural_sizes`.
+        rows: Indices of the states and hidden states that must be steady. Default: all.
+        free: Indices of the free unknowns. Default: states and hidden states, at a constant input.
+        settles: Whether the hidden state is settled in between. Default: True.
     """
     n_x, n_z = model.n_x, model.n_x + model.n_h
     scale = natural_sizes(model) if scale is None else scale
     return SteadySearch(
-        StepEquations(model), np.concatenate([scale, input_sizes(model)]), scale, np.zeros(model.n_y),
+        StepEquations(model, rows), np.concatenate([scale, input_sizes(model)]),
+        scale if rows is None else scale[rows], np.zeros(model.n_y),
         np.concatenate([model.x0, np.zeros(model.n_h), model.u0]), np.zeros(0, dtype=np.int64),
-        hidden=slice(n_x, n_z), free=np.arange(n_z) if free is None else free, steady=steady,
+        hidden=slice(n_x, n_z if settles else n_x), free=np.arange(n_z) if free is None else free, steady=EXACT,
     )  # fmt: skip
 
 
@@ -594,7 +604,7 @@ def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
         return np.zeros(0)
     n_x, n_z = model.n_x, model.n_x + model.n_h
     hidden = np.arange(n_x, n_z)
-    search = _of_rows(model, hidden, hidden)
+    search = rest_search(model, rows=hidden, free=hidden, settles=False)
     start = np.concatenate([x0, hidden_fixed_point(model, x0, u0, limit=100), u0])
     found = search.descend(start, np.zeros(model.n_y))
     size = residual_of(search, found.v)
@@ -604,31 +614,6 @@ def hidden_equilibrium(model: HybridModel, x: ArrayLike, u: ArrayLike) -> Array:
             " [HM-MODEL-009]"
         )
     return found.v[n_x:n_z]
-
-
-class _Rows:
-    """Some rows of a step's equations; the others need not hold."""
-
-    def __init__(self, model: HybridModel, rows: Places) -> None:
-        self._all, self._rows = StepEquations(model), rows
-
-    def rest(self, v: Array) -> tuple[Array, Array]:
-        """Those rows of :meth:`StepEquations.rest`."""
-        rest, slopes = self._all.rest(v)
-        return rest[self._rows], slopes[self._rows]
-
-    def shown(self, v: Array) -> tuple[Array, Array]:
-        """As :meth:`StepEquations.shown`."""
-        return self._all.shown(v)
-
-
-def _of_rows(model: HybridModel, rows: Places, free: Places, hidden: slice = slice(0, 0)) -> SteadySearch:
-    scale = natural_sizes(model)
-    return SteadySearch(
-        _Rows(model, rows), np.concatenate([scale, input_sizes(model)]), scale[rows], np.zeros(model.n_y),
-        np.concatenate([model.x0, np.zeros(model.n_h), model.u0]), np.zeros(0, dtype=np.int64), hidden=hidden,
-        free=free, steady=EXACT,
-    )  # fmt: skip
 
 
 def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None = None) -> Array:
@@ -657,7 +642,7 @@ def holding_input(model: HybridModel, q: ArrayLike, *, u_guess: ArrayLike | None
     x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
     guess = np.zeros(model.n_u) if u_guess is None else vector(u_guess, model.n_u, "u_guess")
     n_x, n_z = model.n_x, model.n_x + model.n_h
-    search = _of_rows(model, np.arange(n_q, n_z), np.arange(n_x, n_z + model.n_u), slice(n_x, n_z))
+    search = rest_search(model, rows=np.arange(n_q, n_z), free=np.arange(n_x, n_z + model.n_u))
 
     def begun(u: Array) -> tuple[Array, float]:
         start = np.concatenate([x, hidden_fixed_point(model, x, u, limit=100), u])

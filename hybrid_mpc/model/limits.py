@@ -173,14 +173,15 @@ def check_function(value: object, name: str) -> None:
         raise InputError(f"{name}: must be a function, got {type(value).__name__} [HM-MODEL-023]")
 
 
-def check_flag(value: object, name: str) -> None:
-    """Refuse anything but True and False.
+def check_flag(value: object, name: str) -> bool:
+    """The value; anything but True and False is refused.
 
     Raises:
         InputError: With the argument.
     """
     if not isinstance(value, bool | np.bool_):
         raise InputError(f"{name}: must be True or False, got {type(value).__name__} [HM-MODEL-024]")
+    return bool(value)
 
 
 def whole(value: object, name: str, least: int, most: int) -> int:
@@ -204,11 +205,6 @@ def whole(value: object, name: str, least: int, most: int) -> int:
 
 
 def _shortly(value: object) -> str:
-    huge = isinstance(value, int) and abs(value) > LARGEST
-    return (
-        "a larger one"
-        if huge
-        else f"{value!r:.80}"
-        if isinstance(value, int | float)
-        else type(value).__name__
-    )
+    if isinstance(value, int) and abs(value) > LARGEST:
+        return "a larger one"
+    return f"{value!r:.80}" if isinstance(value, int | float) else type(value).__name__

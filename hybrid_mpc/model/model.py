@@ -109,7 +109,7 @@ class HybridModel:
     step: ca.Function = field(repr=False)
     xdot: ca.Function = field(repr=False)
     output: ca.Function = field(repr=False)
-    with_jacobian: ca.Function | None = field(default=None, repr=False)
+    with_jacobian: ca.Function = field(default=None, repr=False)  # type: ignore[assignment]  # made if missing
     side_by_side: SideBySide | None = field(default=None, repr=False)
     disturbances: tuple[Signal, ...] = ()
     nominal_w: tuple[float, ...] = ()
@@ -137,7 +137,7 @@ class HybridModel:
         _check(self.name, "output", self.output, [x, u, w, p], [y])
         for balance in self.balances:
             _check(self.name, f"balance {balance.name}", balance.residual, [x, x, u, w, p], [(1, 1)])
-        with_jacobian = self.with_jacobian or _with_jacobian(self.step)
+        with_jacobian = self.with_jacobian or with_slopes(self.step)
         object.__setattr__(self, "with_jacobian", with_jacobian)
         n_z = self.n_x + self.n_h
         slopes = [(n_z, n_z), (n_z, self.n_u)]
@@ -226,11 +226,11 @@ class HybridModel:
                     f"{str(error).strip().splitlines()[-1]} [HM-MODEL-027]"
                 ) from error
 
+        step = function("step", point, [x_next, h if h_next is None else h_next])
         return cls(
-            name, dt, tuple(states), tuple(inputs), tuple(outputs),
-            step=function("step", point, [x_next, h if h_next is None else h_next]),
+            name, dt, tuple(states), tuple(inputs), tuple(outputs), step=step,
             xdot=function("xdot", point, [xdot]),
-            output=function("output", [x, u, w, p], [y]), with_jacobian=with_jacobian,
+            output=function("output", [x, u, w, p], [y]), with_jacobian=with_jacobian or with_slopes(step),
             disturbances=tuple(disturbances), nominal_w=tuple(nominal_w), parameters=tuple(parameters),
             balances=()
             if energy is None
@@ -356,7 +356,6 @@ def longer_period(model: HybridModel, periods: int) -> HybridModel:
             f"model {model.name}: periods must be an integer of at least 1, got {periods} [HM-MODEL-028]"
         )
     point = step_symbols(model)
-    assert model.with_jacobian is not None
     by_value, by_jacobian, held = point[:2], point[:2], point[2:]
     a, b = ca.MX.eye(model.n_x + model.n_h), ca.MX.zeros(model.n_x + model.n_h, model.n_u)
     for _ in range(periods):
@@ -484,7 +483,34 @@ def inlined(f: ca.Function, point: Sequence[Expression]) -> list[Expression]:
     return list(f.call(list(point), f.is_a("MXFunction"), False))
 
 
-def _with_jacobian(step: ca.Function) -> ca.Function:
+def at_arguments(
+    model: HybridModel, point: Sequence[ca.MX], given: Sequence[ca.MX], **changes: Any
+) -> HybridModel:
+    """The model as a function of other symbols ``point``, ``x, h, u, w, p``, with ``changes`` of other fields.
+
+    Its own arguments are ``given``, expressions of these symbols.
+    """
+    x, _, u, w, p = point
+    own_x, _, own_u, own_w, own_p = given
+    rate = ca.MX.sym("rate", model.n_x)
+    outer, inner = [x, u, w, p], [own_x, own_u, own_w, own_p]
+    balances = [inlined(b.residual, [own_x, rate, *inner[1:]]) for b in model.balances]
+    return replace(
+        model,
+        step=step_function("step", point, inlined(model.step, given)),
+        xdot=ca.Function("xdot", list(point), inlined(model.xdot, given), [*STEP_INPUTS], ["xdot"]),
+        output=ca.Function("output", outer, inlined(model.output, inner), ["x", "u", "w", "p"], ["y"]),
+        with_jacobian=step_function("with_jacobian", point, inlined(model.with_jacobian, given)),
+        balances=tuple(
+            replace(b, residual=ca.Function("residual", [x, rate, u, w, p], residual))
+            for b, residual in zip(model.balances, balances, strict=True)
+        ),
+        **changes,
+    )
+
+
+def with_slopes(step: ca.Function) -> ca.Function:
+    """A model's ``with_jacobian`` from its ``step``."""
     point = [ca.MX.sym(name, step.size1_in(i)) for i, name in enumerate(STEP_INPUTS)]
     x, h, u = point[:3]
     x_next, h_next = inlined(step, point)  # twice as fast as the derivative of a call

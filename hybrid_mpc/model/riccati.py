@@ -108,7 +108,6 @@ def _lyapunov(a: Array, q: Array) -> Array:
 def linearization(model: HybridModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
     """``A``, ``B``: derivatives of the next ``z = (x, h)`` by ``z`` and ``u`` at ``(x, u)``; and the settled ``h``."""
     h = hidden_fixed_point(model, x, u)
-    assert model.with_jacobian is not None
     _, _, a, b = model.with_jacobian(x, h, u, model.w, model.p)
     return a.full(), b.full(), h
 

@@ -148,14 +148,12 @@ def stage_step(model: HybridModel) -> ca.Function:
 
 def _stage(model: HybridModel) -> ca.Function:
     z, v = ca.MX.sym("z", model.n_x + model.n_h), ca.MX.sym("v", model.n_v)
-    assert model.with_jacobian is not None
     x_next, h_next, a, b = inlined(model.with_jacobian, _point(model, z, v))
     z_next = ca.vertcat(_moved(model, x_next, v), h_next)
     return ca.Function("stage", [z, v], [z_next, ca.densify(a), ca.densify(b)])
 
 
 def _point(model: HybridModel, z: ca.MX, v: ca.MX) -> list[ca.MX]:
-    """Arguments of the model's step."""
     n_u, more = model.n_u, model.n_u + model.n_w
     u = v if v.numel() == n_u else v[:n_u]
     w = v[n_u:more] if model.n_w else ca.MX(ca.DM(model.w))

@@ -168,10 +168,7 @@ class WatchLimits:
             raise InputError(
                 f"limits: the scale of {wrong[0]} must have {n_terms} numbers. Learn the limits again [HM-WATCH-007]"
             )
-        for what, own, given in (
-            ("a period", self.dt, dt),
-            ("a time unit", self.time_unit, time_unit),
-        ):
+        for what, own, given in (("a period", self.dt, dt), ("a time unit", self.time_unit, time_unit)):
             if abs(own - given) > 1e-9 * own:
                 raise InputError(
                     f"limits: learned with {what} of {own:g} s, but that of the model is {given:g} s. Learn them again"

@@ -398,9 +398,8 @@ def _residual(
     inertia, speed = inertia_of(model, state, held_input), state[n_q:]
     mean, slowed, jump = _near_rest(model, state[:n_q], hidden, held_input, rest)
     friction = ca.fmax(0, inertia @ jump)
-    damping = (
-        (inertia @ slowed - friction) * speed / rest
-    )  # damping between joints counts as that of each joint
+    # damping between joints counts as that of each joint
+    damping = (inertia @ slowed - friction) * speed / rest
     held = inertia @ (measured - mean) + damping  # without dry friction
     held = ca.sign(held) * ca.fmax(0, ca.fabs(held) - friction)
     near = ca.fmax(0, ca.fmin(1, 2 - ca.fabs(speed) / rest))
@@ -433,16 +432,8 @@ def _free_run(
 
 
 def _pushed(
-    layout: Layout,
-    memory: ca.MX,
-    still: ca.MX,
-    x: ca.MX,
-    h: ca.MX,
-    u: ca.MX,
-    w: ca.MX,
-    rest: ca.DM,
-    spans: ca.DM,
-) -> tuple[ca.MX, ca.MX, ca.MX]:
+    layout: Layout, memory: ca.MX, still: ca.MX, x: ca.MX, h: ca.MX, u: ca.MX, w: ca.MX, rest: ca.DM, spans: ca.DM
+) -> tuple[ca.MX, ca.MX, ca.MX]:  # fmt: skip
     """Predicted speed and travel ``(n_q,)`` due to the input since the sensors' last change, and the input then.
 
     With a frozen sensor, the estimator takes the machine for standing still and explains it by an unknown load, while

@@ -96,12 +96,6 @@ def table(trace: Trace, y: Array, outputs: Sequence[Signal], monitor: Monitor) -
     columns |= {f"{name}_frozen": trace.frozen[:, i] for i, name in enumerate(trace.outputs)}
     columns |= {"share": trace.share, "valid": trace.validity == Validity.VALID, "alarm": trace.alarm}
     text = io.StringIO()
-    np.savetxt(
-        text,
-        np.column_stack([*columns.values()]),
-        fmt="%.9g",
-        delimiter=",",
-        header=",".join(columns),
-        comments="",
-    )
+    rows, header = np.column_stack([*columns.values()]), ",".join(columns)
+    np.savetxt(text, rows, fmt="%.9g", delimiter=",", header=header, comments="")
     return text.getvalue()

@@ -16,7 +16,7 @@ from hybrid_mpc.watch.detector import ChannelLimit, Detector, WatchLimits
 from hybrid_mpc.watch.lengths import BLOCK_S, block_seconds, settling_samples
 from hybrid_mpc.watch.monitor import Monitor
 from hybrid_mpc.watch.readings import ENERGY, FROZEN_STEPS, Readings, Test
-from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, replay, stretches
+from hybrid_mpc.watch.replay import EstimatorLike, Trace, TrajectoryLike, along, replay, stretches
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -65,15 +65,10 @@ def learn_limits(
     Example: ``learn_limits(make_readings(model), observer, dataset.whole, data_hash=dataset.hash)``
     """
     monitor, given = Monitor(readings), list(recordings)
-    total, before, traces = sum(len(r.t) for r in given), 0, []
-    for recording in given:
-        start = before
-
-        def say(done: int, own: int, start: int = start) -> None:
-            on_progress(start + done, total)
-
-        traces.append(replay(monitor, estimator, recording, on_progress=say))
-        before += len(recording.t)
+    traces = [
+        replay(monitor, estimator, recording, on_progress=say)
+        for recording, say in along(given, lambda key, done, total, text: on_progress(done, total))
+    ]
     return limits_of(
         readings, [r.y for r in given], traces, false_alarms_per_hour=false_alarms_per_hour, nominal=nominal,
         resolution=resolution, data_hash=data_hash,
@@ -146,26 +141,15 @@ def limits_of(
             for one, runs in zip(found, levels, strict=True)
         ]
     travel, repeats = _freezing(readings, ys, traces, masks, resolution)
-    method = (
-        f"{MARGIN} x the highest nominal level ({short})"
-        if short
-        else f"extreme values of blocks of {block_s:g} s"
-    )
+    method = f"{MARGIN} x the highest nominal level ({short})" if short else (
+        f"extreme values of blocks of {block_s:g} s"
+    )  # fmt: skip
     rest = tuple(getattr(readings, "rest_speed", ()))
     return WatchLimits(
-        kind=readings.kind,
-        dt=model.dt,
-        channels=tuple(found),
-        travel=travel,
-        repeats=repeats,
-        false_alarms_per_hour=rate,
-        hours=seconds / 3600,
-        method=method,
-        rated=not short,
-        rest_speed=rest,
-        data_hash=data_hash,
-        time_unit=model.time_unit,
-    )
+        kind=readings.kind, dt=model.dt, channels=tuple(found), travel=travel, repeats=repeats,
+        false_alarms_per_hour=rate, hours=seconds / 3600, method=method, rated=not short, rest_speed=rest,
+        data_hash=data_hash, time_unit=model.time_unit,
+    )  # fmt: skip
 
 
 def settled(mask: ArrayLike, first: int) -> Mask:

@@ -14,7 +14,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.model import HybridModel, positions_of
 from hybrid_mpc.watch.detector import Detector, DetectorState, WatchLimits
 from hybrid_mpc.watch.energy import EnergyReadings, check_model
-from hybrid_mpc.watch.readings import ENERGY, FROZEN_STEPS, RESIDUALS, Readings, Validity
+from hybrid_mpc.watch.readings import ENERGY, FROZEN_STEPS, RESIDUALS, Readings, Sample
 from hybrid_mpc.watch.residuals import ResidualReadings
 
 Array = NDArray[np.float64]
@@ -32,40 +32,26 @@ class MonitorState:
 
 
 @dataclass(frozen=True)
-class Reading:
-    """Reading of a monitor in one period.
+class Reading(Sample):
+    """Reading of a monitor in one period: the sample of its readings, and what the limits make of it.
 
     Args:
-        values: Value of each channel [its unit]; NaN if unknown.
-        terms: Regressors of the variance of nominal values, for each channel.
         levels: Level of each limit [deviations, or the unit of the channel]; empty without limits.
         share: The largest level over its threshold [-]; NaN without limits.
         on: Which limits are exceeded.
         channels: Names of the channels that alarm.
         frozen_outputs: Names of the outputs with a frozen sensor.
-        travel: Predicted motion of each output since its reading last changed ``(n_y,)`` [its unit].
-        repeats: Number of samples since that change ``(n_y,)``.
-        inside: Which outputs lie inside their sensors' ranges ``(n_y,)``.
-        settled: Whether the values count: the estimator has settled.
         alarm: True while a channel alarms, a sensor is frozen, or the monitor is blind.
-        validity: Whether the values are valid, and if not, why.
         blind: True while there has been no valid reading for longer than the readings' ``patience``.
         violation_w: Violation of the energy balance [W]; NaN if the energy is not read.
     """
 
-    values: Sequence[float] | Array
-    terms: Sequence[Sequence[float]]
     levels: Sequence[float]
     share: float
     on: tuple[bool, ...]
     channels: tuple[str, ...]
     frozen_outputs: tuple[str, ...]
-    travel: Sequence[float] | Array
-    repeats: Sequence[int] | NDArray[np.int_]
-    inside: Sequence[bool] | NDArray[np.bool_]
-    settled: bool
     alarm: bool
-    validity: Validity
     blind: bool
     violation_w: float
 
@@ -178,8 +164,8 @@ class Monitor:
         )  # fmt: skip
         violation = math.nan if self._violation is None else float(s.values[self._violation])
         return MonitorState(memory, detector, invalid), Reading(
-            s.values, s.terms, levels, share, on, names, stuck, s.travel, s.repeats, s.inside, s.settled,
-            alarming or bool(stuck) or blind, s.validity, blind, violation,
+            **vars(s), levels=levels, share=share, on=on, channels=names, frozen_outputs=stuck,
+            alarm=alarming or bool(stuck) or blind, blind=blind, violation_w=violation,
         )  # fmt: skip
 
     def frozen(self, travel: Any, repeats: Any, inside: Any) -> tuple[str, ...]:

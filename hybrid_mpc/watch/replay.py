@@ -128,20 +128,8 @@ def trace_of(monitor: Monitor, t: ArrayLike, readings: Sequence[Reading]) -> Tra
     outputs = tuple(s.name for s in monitor.model.outputs)
     shape = (n, len(channels), monitor.readings.n_terms)
     terms = np.array([r.terms for r in readings]).reshape(shape) if shape[2] else np.zeros(shape)
-    columns: dict[str, Any] = {
-        name: np.array([getattr(r, name) for r in readings])
-        for name in (
-            "values",
-            "share",
-            "travel",
-            "repeats",
-            "inside",
-            "settled",
-            "alarm",
-            "validity",
-            "blind",
-        )
-    }
+    names = "values", "share", "travel", "repeats", "inside", "settled", "alarm", "validity", "blind"
+    columns: dict[str, Any] = {name: np.array([getattr(r, name) for r in readings]) for name in names}
     return Trace(
         np.asarray(t, dtype=np.float64), channels, outputs, terms=terms,
         levels=np.array([r.levels for r in readings]).reshape(n, -1),

@@ -34,7 +34,7 @@ GOOD = {
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"horizon": 0}, "HM-CONTROL-011"),
+        ({"horizon": 0}, r"horizon.*HM-MODEL-025"),
         ({"horizon": 2.5}, "horizon"),
         ({"horizon": np.nan}, "horizon"),
         ({"horizon": np.inf}, "horizon"),
@@ -43,7 +43,7 @@ GOOD = {
         ({"q": np.eye(2)}, "HM-CONTROL-020"),
         ({"soft": [3]}, "SoftBound"),
         ({"economic": 3}, "economic"),
-        ({"blocks": (np.nan, 10)}, "HM-CONTROL-026"),
+        ({"blocks": (np.nan, 10)}, r"blocks.*HM-MODEL-025"),
         ({"q": [-1.0, 0.1]}, "HM-CONTROL-022"),
         ({"q": [np.nan, 0.1]}, "HM-CONTROL-022"),
         ({"r": [0.0]}, "HM-CONTROL-023"),
@@ -57,8 +57,8 @@ GOOD = {
         ({"terminal": -np.eye(2)}, "HM-CONTROL-029"),
         ({"blocks": (1, 2, 4)}, r"10.*HM-CONTROL-026"),
         ({"blocks": (5, 5, 5)}, r"10.*HM-CONTROL-026"),
-        ({"blocks": (10, 0)}, "HM-CONTROL-026"),
-        ({"blocks": (2.5, 7.5)}, "HM-CONTROL-026"),
+        ({"blocks": (10, 0)}, r"blocks.*HM-MODEL-025"),
+        ({"blocks": (2.5, 7.5)}, r"blocks.*HM-MODEL-025"),
         ({"blocks": ()}, "HM-CONTROL-026"),
     ],
 )

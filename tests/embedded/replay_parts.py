@@ -173,9 +173,7 @@ def replay(whole, case, *, own=False, told=True, known=None):
     """
     steps, result = run(case) if known is None else known
     model, ocp, view = whole.model, whole.ocp, whole.view
-    preview = Previews(
-        case.reference, case.weight, ocp, model.dt, np.inf, case.safe.controller.problem.standing()[0]
-    )
+    preview = Previews(case.reference, case.weight, case.safe.controller.problem, np.inf)
     n_measured = model.n_w - n_tracked(case.estimator)
     forecast = Forecast(case.w, ocp, n_measured, model.dt)
     size = case.safe.controller.problem.sizes.states

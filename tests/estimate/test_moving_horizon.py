@@ -1,5 +1,7 @@
 """The window's estimate is the Kalman filter's where nothing else acts, and IPOPT's where bounds and outliers do."""
 
+from functools import partial
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from hybrid_mpc import (
     Signal,
     TrackedParameter,
     TrackingFilter,
+    UnscentedKalmanFilter,
 )
 
 STATES = ("x", "h", "d")
@@ -68,20 +71,43 @@ TANK = {
 }
 
 
-@pytest.mark.parametrize(("n_h", "periods"), [(0, 5), (0, 60), (3, 8)])
-def test_without_bounds_and_outliers_it_is_the_kalman_filter(n_h, periods):
+def plain(model, periods=6):
+    """Without a robust loss the window's estimate of a linear model is the Kalman filter's."""
+    return MovingHorizonEstimator(model, **sigmas(model), periods=periods, huber=np.inf, jump=np.inf)
+
+
+def unscented(model):
+    return UnscentedKalmanFilter(model, **sigmas(model))
+
+
+@pytest.mark.parametrize(
+    ("n_h", "kind"),
+    [
+        (0, partial(plain, periods=5)),
+        (0, partial(plain, periods=60)),
+        (3, partial(plain, periods=8)),
+        (0, unscented),
+        (3, unscented),
+    ],
+    ids=["window 5", "window 60", "window 8, h", "unscented", "unscented, h"],
+)
+def test_on_a_linear_model_it_is_the_kalman_filter(n_h, kind):
     model, *_ = random_linear(4, n_x=3, n_u=2, n_y=2, n_h=n_h)
     rng = np.random.default_rng(0)
     ys, us = rng.normal(size=(40, 2)), rng.normal(size=(40, 2))
     ys[7], ys[9, 0] = np.nan, np.nan
-    mhe = MovingHorizonEstimator(model, **sigmas(model), periods=periods, huber=np.inf, jump=np.inf)
-    got, want = mhe.run(ys, us), ExtendedKalmanFilter(model, **sigmas(model)).run(ys, us)
-    for a, b in zip(got, want, strict=True):
+    got, want = kind(model), ExtendedKalmanFilter(model, **sigmas(model))
+    for a, b in zip(got.run(ys, us), want.run(ys, us), strict=True):
         np.testing.assert_allclose(stacked(a), stacked(b), rtol=0, atol=1e-9)
         np.testing.assert_allclose(a.P, b.P, rtol=0, atol=1e-9)
         np.testing.assert_allclose(
             [*a.innovation, a.nis, a.t], [*b.innovation, b.nis, b.t], rtol=0, atol=1e-9
         )
+    ahead = want.predict(want.start(ys[0]), us[0])
+    assert got.assess(ahead, ys[1])[1] == pytest.approx(want.assess(ahead, ys[1])[1], abs=1e-9)
+    np.testing.assert_allclose(
+        got.innovation_covariance(ahead), want.innovation_covariance(ahead), atol=1e-12
+    )
 
 
 def solved_by_ipopt(mhe, e, first):
@@ -229,15 +255,9 @@ PENDULUM = {
 @pytest.mark.parametrize("n", [2000, pytest.param(50_000, marks=pytest.mark.full)])
 def test_rubbish_raises_nothing(n):
     survives(MovingHorizonEstimator, tanks(), n, **TANK)
-    survives(
-        MovingHorizonEstimator,
-        pendulum_model(z=3),
-        n // 5,
-        **PENDULUM,
-        huber=np.inf,
-        jump=np.inf,
-        iterations=3,
-    )
+    converging = {"huber": np.inf, "jump": np.inf, "iterations": 3}
+    survives(MovingHorizonEstimator, pendulum_model(z=3), n // 5, **PENDULUM, **converging)
+    survives(UnscentedKalmanFilter, pendulum_model(z=3), n, **PENDULUM)
 
 
 def test_a_jump_of_the_load_is_found_sooner_than_by_the_kalman_filter():
@@ -253,28 +273,27 @@ def test_a_jump_of_the_load_is_found_sooner_than_by_the_kalman_filter():
     assert errors[MovingHorizonEstimator] < 0.5 * errors[ExtendedKalmanFilter], errors
 
 
-def test_a_constant_load_leaves_no_offset():
+@pytest.mark.parametrize("kind", [MovingHorizonEstimator, UnscentedKalmanFilter])
+def test_a_constant_load_leaves_no_offset(kind):
     model = pendulum_model()
-    mhe = MovingHorizonEstimator(model, **PENDULUM)
-    x, e = np.zeros(2), mhe.start([0.0])
+    filter = kind(model, **PENDULUM)
+    x, e = np.zeros(2), filter.start([0.0])
     for _ in range(300):
         x = model.step(x, [], [0.3 + 0.5], model.w, model.p)[0].full().ravel()
-        e = mhe.update(e, x[:1], [0.3])
+        e = filter.update(e, x[:1], [0.3])
     np.testing.assert_allclose(e.d, 0.5, rtol=0, atol=0.01)
-    np.testing.assert_allclose(e.x, x, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(e.x, x, rtol=0, atol=2e-3)
 
 
+@pytest.mark.parametrize("kind", [plain, unscented])
 @pytest.mark.parametrize("delays", [(0, 2), (3, 1)])
-def test_with_delays_it_is_the_delayed_kalman_filter(delays):
+def test_with_delays_it_is_the_delayed_kalman_filter(kind, delays):
     model, *_ = random_linear(4, n_x=3, n_u=2, n_y=2)
     rng = np.random.default_rng(0)
     ys, us = rng.normal(size=(30, 2)), rng.normal(size=(30, 2))
     got, want = (
         DelayCompensation(f, sensor_delay=delays[0], input_delay=delays[1])
-        for f in (
-            MovingHorizonEstimator(model, **sigmas(model), huber=np.inf, jump=np.inf, periods=6),
-            ExtendedKalmanFilter(model, **sigmas(model)),
-        )
+        for f in (kind(model), ExtendedKalmanFilter(model, **sigmas(model)))
     )
     a, b = got.start(ys[0]), want.start(ys[0])
     for y, u in zip(ys[1:], us, strict=False):
@@ -307,8 +326,9 @@ def test_measured_disturbances_act_in_their_period():
     rng = np.random.default_rng(0)
     ys, us, ws = (rng.normal(size=(30, 1)) for _ in range(3))
     ws[4] = np.nan
-    mhe = MovingHorizonEstimator(model, **sigmas(model), huber=np.inf, jump=np.inf, periods=5)
-    got, want = (f.run(ys, us, w=ws)[-1] for f in (mhe, ExtendedKalmanFilter(model, **sigmas(model))))
+    got, want = (
+        f.run(ys, us, w=ws)[-1] for f in (plain(model), ExtendedKalmanFilter(model, **sigmas(model)))
+    )
     np.testing.assert_allclose(stacked(got), stacked(want), rtol=0, atol=1e-9)
 
 

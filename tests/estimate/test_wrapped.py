@@ -9,6 +9,7 @@ from wrapped_machine import SIGMAS, boat, problem, samples, wrapped
 
 from hybrid_mpc import (
     CondensedController,
+    DelayCompensation,
     ExtendedKalmanFilter,
     InputError,
     Loop,
@@ -17,7 +18,9 @@ from hybrid_mpc import (
     Signal,
     SwitchingFilter,
     UnscentedKalmanFilter,
+    simulate,
 )
+from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.machine.signals import nearest_turn
 
 ROUNDING = 1e-8
@@ -125,3 +128,22 @@ def test_a_set_point_is_reached_the_short_way_on_request():
         True, nearest_turn=True, reference=lambda t: np.column_stack([350.0 + 12.0 * t, 12.0 + 0.0 * t])
     )
     assert turning[-1] > 700.0  # a reference that turns on purpose
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_a_simulation_goes_the_short_way_and_its_cost_is_that_of_this_way(delay):
+    model = boat()
+
+    def run(reference, **options):
+        observer = observers()["extended"]
+        return simulate(
+            ModelPlant(model, (0.0, 0.0)), DelayCompensation(observer, input_delay=delay) if delay else observer,
+            CondensedController(model, problem()), reference, dt=model.dt, duration=20.0, x0=[350.0, 0.0], seed=0,
+            w=[358.0], input_delay=delay, **options,
+        )  # fmt: skip
+
+    counted, found = run([380.0, 0.0]), run([20.0, 0.0], nearest_turn=True)
+    assert np.allclose(counted.x, found.x, rtol=0, atol=1e-6)
+    assert found.x[-1, 0] == pytest.approx(380.0, abs=1.0)
+    assert found.reference[:, 0] == pytest.approx(380.0)
+    assert found.cost == pytest.approx(counted.cost)

@@ -23,17 +23,8 @@ KINDS = [
     [1.0, 2.0, 3.0, 4.0, 5.0], np.zeros((2, 2, 2)),
 ]  # fmt: skip
 VALUES = [
-    np.nan,
-    np.inf,
-    -np.inf,
-    10**400,
-    -(10**400),
-    1e300,
-    True,
-    np.float32(0.1),
-    np.int8(3),
-    np.ma.masked,
-]
+    np.nan, np.inf, -np.inf, 10**400, -(10**400), 1e300, True, np.float32(0.1), np.int8(3), np.ma.masked,
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -106,19 +97,8 @@ def test_numbers_of_any_kind_become_floats():
 
 
 NONE_OF_A_LOOP = [
-    np.nan,
-    3,
-    "abc",
-    b"1",
-    {},
-    [1.0],
-    object(),
-    Raises(),
-    int,
-    np.zeros(2),
-    lambda: 1.0,
-    10**400,
-]
+    np.nan, 3, "abc", b"1", {}, [1.0], object(), Raises(), int, np.zeros(2), lambda: 1.0, 10**400,
+]  # fmt: skip
 PARTS = ("estimator", "controller", "monitor", "guard")
 FUNCTIONS = ("weight", "now", "measure", "actuate", "measure_w", "on_step", "late")
 PERIODS = [2.5, -1, True, "3", None, 1 + 0j, np.nan, np.inf, [1], 10**400, np.ma.masked, Raises()]

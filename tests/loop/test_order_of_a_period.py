@@ -252,7 +252,7 @@ def test_what_cannot_be_is_refused(model, safe):
         make_loop(model, safe).step([0.0])
     with pytest.raises(InputError, match="HM-LOOP-019"):
         make_loop(model, safe, guard=Guard())
-    with pytest.raises(InputError, match=r"the reference.*HM-MODEL-019"):
+    with pytest.raises(InputError, match=r"reference \(states: phi .*HM-MODEL-019"):
         make_loop(model, safe, reference=[0.0])
     with pytest.raises(InputError, match=r"sensor_delay.*HM-MODEL-025"):
         make_loop(model, safe, sensor_delay=0.5)

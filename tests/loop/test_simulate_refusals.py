@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from closed_loop_parts import make_ekf, run
 from online_models import PendulumPlant, linear_model, pendulum_model
+from wrapped_machine import SIGMAS, boat
 
-from hybrid_mpc import OCP, Fault, InputError
+from hybrid_mpc import OCP, CondensedController, ExtendedKalmanFilter, Fault, InputError, Loop
 
 
 def test_a_table_has_every_column_with_a_model_its_names_and_units(model, safe):
@@ -48,7 +49,7 @@ class Odd(PendulumPlant):
         ({"weight": lambda t: np.ones(len(t))}, r"weight.*\(11,\).*HM-LOOP-031"),
         ({"sensor_delay": -1}, "sensor_delay"),
         ({"input_delay": 1.5}, "input_delay"),
-        ({"reference": lambda t: np.zeros((len(t), 1))}, r"\(11, 2\).*HM-LOOP-031"),
+        ({"reference": lambda t: np.zeros((len(t), 1))}, r"phi \[rad\]; phi_dot .*\(11, 2\).*HM-LOOP-031"),
         ({"faults": [Fault(0.0, 1.0, "input_gain", channel="third")]}, r"input.*'third'.*HM-LOOP-004"),
         ({"plant": Odd("measure", np.zeros(2))}, r"measurement.*\(2,\).*HM-MODEL-019"),
         ({"plant": Odd("truth", np.zeros(3))}, r"truth.*\(3,\).*HM-MODEL-019"),
@@ -61,3 +62,15 @@ def test_bad_input_is_refused(model, safe, change, words):
         change = {"estimator": make_ekf(pendulum_model())}
     with pytest.raises(InputError, match=words):
         run(model, safe, **change)
+
+
+def test_a_reference_of_another_width_names_the_outputs_and_those_without_weight():
+    model = boat()
+    observer = ExtendedKalmanFilter(model, **SIGMAS)
+    controller = CondensedController(model, OCP(5, [0.0, 0.0], [0.1], [0.1], [-30.0], [30.0], q_y=[1.0, 0.0]))
+    columns = r"outputs: psi \[deg\]; r \[deg/s\], without weight"
+    with pytest.raises(InputError, match=rf"{columns}.*HM-MODEL-019"):
+        Loop(observer, controller, reference=[20.0])
+    estimate = observer.start([0.0, 0.0])
+    with pytest.raises(InputError, match=rf"{columns}.*HM-CONTROL-038"):
+        controller.solve(controller.initial(estimate), estimate, np.zeros((3, 1)))

@@ -63,22 +63,9 @@ def watched(request):
     return request.param, limits
 
 
-def readings(name, limits, run, **options):
+def trace_of(name, limits, run, **options):
     make, _, sigma, step = MACHINES[name]
-    model = make()
-    monitor, estimator = Monitor(ResidualReadings(model), limits, **options), observer(model, sigma, step)
-    state, estimate, found = monitor.initial(), None, []
-    for k, y in enumerate(run.y):
-        u_prev = run.u[k - 1] if k else np.full(model.n_u, np.nan)
-        also = {"w": run.w[k]} if model.n_w else {}
-        estimate = (
-            estimator.start(y, 0.0, **also)
-            if estimate is None
-            else estimator.update(estimate, y, u_prev, **also)
-        )
-        state, reading = monitor.update(state, y, u_prev, estimate)
-        found.append(reading)
-    return found
+    return replay(Monitor(ResidualReadings(make()), limits, **options), observer(make(), sigma, step), run)
 
 
 @pytest.mark.parametrize("n", [1000, pytest.param(3000, marks=pytest.mark.full)])
@@ -87,8 +74,8 @@ def test_unseen_nominal_runs_raise_few_alarms(watched, n):
     0.3 %, and thresholds from 9000 periods are known to some tens of per cent of the rate."""
     name, limits = watched
     make, swing, sigma, _ = MACHINES[name]
-    alarm = [r.alarm for r in readings(name, limits, recording(make, swing, sigma, n, 11))[200:]]
-    assert np.sum(np.diff(np.array(alarm, dtype=int)) > 0) <= 1
+    alarm = trace_of(name, limits, recording(make, swing, sigma, n, 11)).alarm[200:]
+    assert np.sum(np.diff(alarm.astype(int)) > 0) <= 1
 
 
 def test_a_load_that_the_model_does_not_know_is_found(watched):
@@ -96,22 +83,20 @@ def test_a_load_that_the_model_does_not_know_is_found(watched):
     name, limits = watched
     make, swing, sigma, _ = MACHINES[name]
     load = 0.5 * np.array(swing)
-    found = readings(name, limits, recording(make, swing, sigma, 800, 12, load=load))
-    assert np.mean([r.alarm for r in found[400:]]) > 0.5
-    assert found[-1].share > 0.0
+    found = trace_of(name, limits, recording(make, swing, sigma, 800, 12, load=load))
+    assert np.mean(found.alarm[400:]) > 0.5
+    assert found.share[-1] > 0.0
 
 
 def test_a_frozen_sensor_is_named(watched):
     name, limits = watched
     make, swing, sigma, _ = MACHINES[name]
-    model = make()
     run = recording(
         make, 2 * np.array(swing), sigma, 600, 13, broken=lambda k, y, held: held if k >= 400 else y
     )
-    found = readings(name, limits, run, resolution=[sigma] * model.n_y)
-    assert not any(r.frozen for r in found[:400])
-    assert any(r.frozen for r in found[400:])
-    assert {out for r in found[400:] for out in r.frozen_outputs} <= {s.name for s in model.outputs}
+    frozen = trace_of(name, limits, run, resolution=[sigma] * make().n_y).frozen
+    assert not frozen[:400].any()
+    assert frozen[400:].any()
 
 
 def test_a_sensor_at_the_end_of_its_range_is_not_frozen():
@@ -122,13 +107,7 @@ def test_a_sensor_at_the_end_of_its_range_is_not_frozen():
     assert np.mean(run.y == top) > 0.1
     limited = tuple(type(s)(s.name, s.unit, saturation=(0.0, top)) for s in model.outputs)
     known = Monitor(ResidualReadings(replace(model, outputs=limited)), resolution=[1e-3, 1e-3])
-    estimator, estimate, state, frozen = observer(model, sigma, 1e-2), None, known.initial(), []
-    for k, y in enumerate(run.y):
-        u_prev = run.u[k - 1] if k else np.full(model.n_u, np.nan)
-        estimate = estimator.start(y, 0.0) if estimate is None else estimator.update(estimate, y, u_prev)
-        state, reading = known.update(state, y, u_prev, estimate)
-        frozen.append(reading.frozen)
-    assert not any(frozen)
+    assert not replay(known, observer(model, sigma, 1e-2), run).frozen.any()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
@@ -138,12 +117,11 @@ def test_rubbish_raises_nothing_and_makes_it_blind(watched, value):
     run = recording(make, swing, sigma, 300, 15)
     run.y[100:] = value
     with np.errstate(all="ignore"):
-        found = readings(name, limits, run)
-    assert found[99].validity is Validity.VALID
+        found = trace_of(name, limits, run)
+    assert found.validity[[0, 99]].tolist() == [Validity.WARM_UP, Validity.VALID]
     if not np.isfinite(value):
-        assert all(r.validity is not Validity.VALID for r in found[100:])
-    assert found[-1].alarm
-    assert found[0].validity is Validity.WARM_UP
+        assert (found.validity[100:] != Validity.VALID).all()
+    assert found.alarm[-1]
 
 
 def test_the_violation_of_a_mechanical_machine_is_its_power():

@@ -16,7 +16,7 @@ from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.identify.export import check_parity, trace_model
 from hybrid_mpc.identify.prior_model import model_info
 from hybrid_mpc.identify.step import PriorStep, RecurrentStep
-from hybrid_mpc.kit.artifact import member_names, save_models
+from hybrid_mpc.kit.artifact import member_names, save_artifact
 from hybrid_mpc.kit.parts import (
     MOST_MEMBERS,
     PROGRAMS,
@@ -113,7 +113,7 @@ def export_stage(context: Context) -> ExportResult:
     )  # fmt: skip
     folder = context.out / "model"
     beside = [programs.pop(name) for name in members]
-    programs_sha256 = save_models(
+    programs_sha256 = save_artifact(
         folder, programs, deployed, provenance=provenance,
         recommended="prior" if chosen.choice.recommended == "phy" else "hybrid", members=beside,
         predicting=predicting(context, phy),
