@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from hybrid_mpc import DataSpec, Prior
 
 Array = NDArray[np.float64]
-Rates = Callable[[Array, Array, float], Array]
 
 
 @dataclass(frozen=True)
@@ -53,32 +52,6 @@ class Machine:
                 for row in rows:  # a blank cell is a missing sample
                     file.write(",".join("" if np.isnan(v) else f"{v:.7g}" for v in row) + "\n")
         return files
-
-
-def run(
-    rates: Rates,
-    x: Array,
-    control: Callable[[int, Array], Array],
-    measure: Callable[[Array], Array],
-    dt: float,
-    samples: int,
-    steps: int = 4,
-) -> tuple[Array, Array, Array]:
-    """Times, inputs and measured outputs of a plant ``rates(x, u, t)`` under ``control(k, y)``; RK4."""
-    t, h = dt * np.arange(samples), dt / steps
-    inputs, outputs = [], []
-    for k in range(samples):
-        y = measure(x)
-        u = np.atleast_1d(control(k, y))
-        inputs.append(u)
-        outputs.append(y)
-        for i in range(steps):
-            now = t[k] + i * h
-            k1 = rates(x, u, now)
-            k2 = rates(x + h / 2 * k1, u, now + h / 2)
-            k3 = rates(x + h / 2 * k2, u, now + h / 2)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3, u, now + h))
-    return t, np.array(inputs), np.array(outputs)
 
 
 def quantised(y: Array, steps: float | Array) -> Array:
