@@ -18,7 +18,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy is loaded
 
 import argparse
 import inspect
-import json
 import math
 import sys
 import tempfile
@@ -29,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from unknown.common import Machine
+from unknown.common import Machine, report
 from unknown.motion import MOTION
 from unknown.processes import PROCESSES
 from unknown_machines import read
@@ -385,17 +384,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for mistake in (one for one in MISTAKES if one.machine == name):
                 rows.append(judged(mistake, Path(folder), right))
                 print(rows[-1], flush=True)
-    print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
-    for row in rows:
-        print("| " + " | ".join(str(v).replace("|", "\\|") for v in row.values()) + " |")
+    report(rows, given.out)
     planted = [r for r in rows if not r["kind"].startswith("none")]
     sound = [r for r in rows if r["kind"].startswith("none")]
     print(
         f"\nplanted: {sum(r['right'] == 'yes' for r in planted)} of {len(planted)} named right; none: "
         f"{sum(r['right'] == 'yes' for r in sound)} of {len(sound)} left alone"
     )
-    if given.out is not None:
-        given.out.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""What all machines share: how a plant is run and recorded."""
+"""What all machines share: how they are recorded, and the table of a benchmark of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,3 +80,13 @@ def levels(
         out[k : k + n] = rng.uniform(low, high)
         k += n
     return out
+
+
+def report(rows: Sequence[Mapping[str, object]], out: Path | None) -> None:
+    """Rows as a Markdown table, and as a JSON file."""
+    if rows:
+        print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
+    for row in rows:
+        print("| " + " | ".join(str(v).replace("|", "\\|") for v in row.values()) + " |")
+    if out is not None:
+        out.write_text(json.dumps(rows, indent=1) + "\n")

@@ -254,11 +254,7 @@ class HydraulicCylinder(Prior):
         """Flow through the valve by the root of its pressure drop."""
         drop = p.p_s - ca.tanh(u.u / 0.05) * x.p_L
         flow = p.k_q * u.u * ca.sqrt(ca.fmax(drop, 1e-3))
-        return (
-            x.s_dot,
-            (1e5 * p.A * x.p_L - p.b * x.s_dot) / p.m,
-            1000 * p.C * (flow - p.A * x.s_dot),
-        )
+        return (x.s_dot, (1e5 * p.A * x.p_L - p.b * x.s_dot) / p.m, 1000 * p.C * (flow - p.A * x.s_dot))
 
 
 def hydraulic_cylinder(seed: int) -> Array:

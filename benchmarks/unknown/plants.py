@@ -126,12 +126,7 @@ def evaporator_rates(x: Array, u: Array, w: Array, p: Any) -> Array:
     f5 = ua * (0.507 * pressure + 55.0 - 25.0)
     return (
         np.array(
-            [
-                (f1 - f4 - u[0]) / p.A,
-                (f1 * 5.0 - u[0] * conc) / p.M,
-                (f4 - f5) / p.C,
-                (u[1] - lag) / p.T,
-            ]
+            [(f1 - f4 - u[0]) / p.A, (f1 * 5.0 - u[0] * conc) / p.M, (f4 - f5) / p.C, (u[1] - lag) / p.T]
         )
         / 60
     )

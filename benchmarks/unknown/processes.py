@@ -152,11 +152,7 @@ class Evaporator(Prior):
         t2 = 0.5616 * x.P + 0.3126 * x.X + 48.43
         f4 = p.UA * (0.1538 * u.steam + 90.0 - t2)
         f5 = p.k * u.F200 * (0.507 * x.P + 55.0 - 25.0) * 0.07
-        return (
-            (w.F1 - f4 - u.F2) / p.A / 60,
-            (w.F1 * p.X1 - u.F2 * x.X) / p.M / 60,
-            (f4 - f5) / p.C / 60,
-        )
+        return ((w.F1 - f4 - u.F2) / p.A / 60, (w.F1 * p.X1 - u.F2 * x.X) / p.M / 60, (f4 - f5) / p.C / 60)
 
 
 def evaporator(seed: int) -> Array:
