@@ -75,10 +75,7 @@ class DcMotor(SimulatedPlant):
         current, speed = z
         dry = p.load + (p.stiction - p.load) * ca.exp(-((speed / p.stribeck_speed) ** 2))
         rubbing = dry * ca.tanh(speed / 0.2)
-        return (
-            (u[0] - p.R * current - p.k * speed) / p.L,
-            (p.k * current - p.d * speed - rubbing) / p.J,
-        )
+        return ((u[0] - p.R * current - p.k * speed) / p.L, (p.k * current - p.d * speed - rubbing) / p.J)
 
     def outputs(self, z: Any, u: Any, w: Any, p: Any) -> Any:
         """Current [A] and speed [rad/s]."""
