@@ -18,7 +18,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy is loaded
 
 import argparse
 import inspect
-import json
 import math
 import sys
 import tempfile
@@ -29,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from unknown.common import Machine
+from unknown.common import Machine, report
 from unknown.motion import MOTION
 from unknown.processes import PROCESSES
 from unknown_machines import read
@@ -76,258 +75,193 @@ class Mistake:
         return 0.5 <= off <= 2.0 and any(all(text in said for text in texts) for texts in self.named)
 
 
-SIGN, SMALL = "sign", "times too large"
+SIGN = "sign"
+PLANTED: dict[str, tuple[tuple[Any, ...], ...]] = {
+    "heat_exchanger_2": (
+        (
+            "sign",
+            "- k * (x.hot_1 - x.cold_2)) / p.V_h",
+            "+ k * (x.hot_1 - x.cold_2)) / p.V_h",
+            (("(hot_1 - cold_2)", "rate of hot_1", SIGN),),
+        ),
+        ("unit", "qh, qc = u.hot_flow / 60, u", "qh, qc = u.hot_flow, u", (("hot_flow",),), 60),
+        (
+            "sign",
+            "+ k * (x.hot_1 - x.cold_2)) / p.V_c",
+            "- k * (x.hot_1 - x.cold_2)) / p.V_c",
+            (("(hot_1 - cold_2)", "rate of cold_2", SIGN),),
+        ),
+        ("swapped column", "outputs", "", (("outputs", "exchanged"),)),
+    ),
+    "quadruple_tank": (
+        (
+            "sign",
+            "p.g1 * p.k1 * u.v1 + p.a34 * q[2]",
+            "p.g1 * p.k1 * u.v1 - p.a34 * q[2]",
+            (("a34", "rate of h1", SIGN),),
+        ),
+        ("swapped column", "inputs", "", (("inputs", "exchanged"), ("outputs", "exchanged"))),
+        (
+            "unit",
+            "p.g1 * p.k1 * u.v1 +",
+            "p.g1 * p.k1 * u.v1 * 100 +",
+            (("v1", "rate of h1"), ("input v1",)),
+            100,
+        ),
+        (
+            "sign",
+            "(1 - p.g2) * p.k2 * u.v2 - p.a34 * q[2]",
+            "(1 - p.g2) * p.k2 * u.v2 + p.a34 * q[2]",
+            (("rate of h3", SIGN),),
+        ),
+    ),
+    "bioreactor": (
+        ("sign", "(mu - u.D) * x.X", "(mu + u.D) * x.X", (("D in the rate of X", SIGN),)),
+        ("sign", "- mu * x.X / p.Y", "+ mu * x.X / p.Y", (("rate of S", SIGN),)),
+        ("unit", "(mu - u.D) * x.X / 3600", "(mu - u.D) * x.X", (("rate of X",),), 3600),
+        (
+            "unit",
+            "(mu - u.D) * x.X / 3600, (u.D * (p.S_f - x.S) - mu * x.X / p.Y) / 3600",
+            "(mu - u.D) * x.X / 3600, (u.D * (p.S_f - x.S) - mu * x.X / p.Y) / 60",
+            (("rate of S",),),
+            60,
+        ),
+    ),
+    "evaporator": (
+        ("sign", "(w.F1 - f4 - u.F2)", "(w.F1 - f4 + u.F2)", (("F2 in the rate of L", SIGN),)),
+        ("sign", "(f4 - f5)", "(f5 - f4)", (("rate of P", SIGN),)),
+        (
+            "unit",
+            "(w.F1 - f4 - u.F2) / p.A / 60",
+            "(w.F1 - f4 - u.F2) / p.A",
+            (("rate of L",), ("output L",)),
+            60,
+        ),
+        ("sign", "(w.F1 - f4 - u.F2)", "(w.F1 + f4 - u.F2)", (("rate of L", SIGN),)),
+    ),
+    "column": (
+        (
+            "sign",
+            "(below - u.boil_up) * x.x_B - u.boil_up * y(x.x_B)",
+            "(below - u.boil_up) * x.x_B + u.boil_up * y(x.x_B)",
+            (("boil_up", "rate of x_B", SIGN),),
+        ),
+        ("swapped column", "inputs", "", (("inputs", "exchanged"),)),
+        (
+            "sign",
+            "u.boil_up * (y(x.x_2) - x.x_D)",
+            "u.boil_up * (x.x_D - y(x.x_2))",
+            (("rate of x_D", SIGN),),
+        ),
+        (
+            "unit",
+            "u.boil_up * (y(x.x_2) - x.x_D) / p.M_e / 60",
+            "u.boil_up * (y(x.x_2) - x.x_D) / p.M_e",
+            (("rate of x_D",),),
+            60,
+        ),
+    ),
+    "building": (
+        ("sign", "p.H_mo * (x.T_m - w.T_o)", "p.H_mo * (x.T_m + w.T_o)", (("T_o", SIGN),)),
+        ("sign", "(flow - p.H_mo", "(-flow - p.H_mo", (("H_im * (T_i - T_m)", "rate of T_m", SIGN),)),
+        ("sign", "+ p.A_w * w.sun - flow", "- p.A_w * w.sun - flow", (("sun", SIGN),)),
+        ("unit", "(u.heat + p.A_w", "(1000 * u.heat + p.A_w", (("heat",),), 1000),
+    ),
+    "flexible_shaft": (
+        ("sign", "- shaft) / p.J_m", "+ shaft) / p.J_m", (("c * twist", "rate of motor", SIGN),)),
+        ("swapped column", "outputs", "", (("outputs", "exchanged"),)),
+        ("sign", "x.motor - x.load\n", "x.load - x.motor\n", (("rate of twist", SIGN),)),
+        (
+            "unit",
+            "shaft / p.J_l, x.motor - x.load",
+            "shaft / p.J_l, (x.motor - x.load) * 57.29578",
+            (("rate of twist",), ("twist in",)),
+            57.29578,
+        ),
+    ),
+    "magnetic_levitation": (
+        ("sign", "9810.0 - p.k *", "9810.0 + p.k *", (("rate of gap_dot", SIGN), ("9810", SIGN))),
+        ("unit", "9810.0 - p.k", "9.81 - p.k", (("9.81",),), 0.001),
+        ("sign", "(u.u - p.R * x.i)", "(u.u + p.R * x.i)", (("R * i", SIGN), ("input u", SIGN))),
+        (
+            "missing factor",
+            "x.gap_dot, 9810",
+            "0.001 * x.gap_dot, 9810",
+            (("gap_dot in the rate of gap:",),),
+            0.001,
+        ),
+    ),
+    "inverted_pendulum": (
+        (
+            "angle",
+            "return p.m * G * p.l * ca.cos(q.phi)",
+            "return -p.m * G * p.l * ca.cos(q.phi)",
+            (("potential", SIGN), ("phi", "another zero")),
+        ),
+        (
+            "sign",
+            "return u.F, 0.0",
+            "return -u.F, 0.0",
+            (("F", SIGN), ("output s", "other way"), ("output phi", "other way")),
+        ),
+        (
+            "sign",
+            "c = p.m * p.l * ca.cos(q.phi)",
+            "c = -p.m * p.l * ca.cos(q.phi)",
+            (("(s, phi)", SIGN), ("output phi", "other way"), ("output s", "other way")),
+        ),
+        ("swapped column", "outputs", "", (("outputs", "exchanged"), ("phi", "s"))),
+    ),
+    "ship": (
+        (
+            "sign",
+            "(u.delta - x.rudder)",
+            "(-u.delta - x.rudder)",
+            (("delta", SIGN), ("psi", "other way"), ("psi", SIGN)),
+        ),
+        (
+            "unit",
+            "return x.r, (p.K",
+            "return x.r * 57.29578, (p.K",
+            (("rate of psi",), ("output psi",), ("input delta",), ("rate of r:",)),
+            57.29578,
+        ),
+        (
+            "sign",
+            "x.r, (p.K * (x.rudder - p.bias) - x.r)",
+            "x.r, (p.K * (x.rudder - p.bias) + x.r)",
+            (("r in the rate of r", SIGN),),
+        ),
+        ("sign", "(u.delta - x.rudder)", "(u.delta + x.rudder)", (("rudder", SIGN),)),
+    ),
+    "ball_and_beam": (
+        (
+            "sign",
+            "-p.k * ca.sin(x.beam - p.off)",
+            "p.k * ca.sin(x.beam - p.off)",
+            (("rate of s_dot", SIGN), ("command", SIGN), ("output s", "other way")),
+        ),
+        (
+            "unit",
+            "ca.sin(x.beam - p.off)",
+            "ca.sin((x.beam - p.off) * 0.01745329)",
+            (("rate of s_dot",), ("s_dot in the rate of s",), ("output s",)),
+            1 / 57.29578,
+        ),
+        ("sign", "(u.command - x.beam)", "(u.command + x.beam)", (("beam", SIGN),)),
+        ("unit", "(u.command - x.beam)", "(u.command * 57.29578 - x.beam)", (("command",),), 57.29578),
+    ),
+    "hydraulic_cylinder": (
+        ("sign", "- p.b * x.s_dot) / p.m", "+ p.b * x.s_dot) / p.m", (("b * s_dot", SIGN),)),
+        ("sign", "(flow - p.A * x.s_dot)", "(flow + p.A * x.s_dot)", (("s_dot", "p_L", SIGN),)),
+        ("unit", "(1e5 * p.A * x.p_L", "(p.A * x.p_L", (("p_L",),), 1e-5),
+        ("unit", "flow = p.k_q * u.u *", "flow = 1000 * p.k_q * u.u *", (("flow",), ("k_q",)), 1000),
+    ),
+}
+"""By machine, the further arguments of its mistakes."""
 MISTAKES = (
     *(Mistake(m.name, "none") for m in (*PROCESSES, *MOTION)),
-    # heat exchanger
-    Mistake(
-        "heat_exchanger_2",
-        "sign",
-        "- k * (x.hot_1 - x.cold_2)) / p.V_h",
-        "+ k * (x.hot_1 - x.cold_2)) / p.V_h",
-        (("(hot_1 - cold_2)", "rate of hot_1", SIGN),),
-    ),
-    Mistake(
-        "heat_exchanger_2",
-        "unit",
-        "qh, qc = u.hot_flow / 60, u",
-        "qh, qc = u.hot_flow, u",
-        (("hot_flow",),),
-        60,
-    ),
-    Mistake(
-        "heat_exchanger_2",
-        "sign",
-        "+ k * (x.hot_1 - x.cold_2)) / p.V_c",
-        "- k * (x.hot_1 - x.cold_2)) / p.V_c",
-        (("(hot_1 - cold_2)", "rate of cold_2", SIGN),),
-    ),
-    Mistake("heat_exchanger_2", "swapped column", "outputs", "", (("outputs", "exchanged"),)),
-    # quadruple tank
-    Mistake(
-        "quadruple_tank",
-        "sign",
-        "p.g1 * p.k1 * u.v1 + p.a34 * q[2]",
-        "p.g1 * p.k1 * u.v1 - p.a34 * q[2]",
-        (("a34", "rate of h1", SIGN),),
-    ),
-    Mistake(
-        "quadruple_tank", "swapped column", "inputs", "", (("inputs", "exchanged"), ("outputs", "exchanged"))
-    ),
-    Mistake(
-        "quadruple_tank",
-        "unit",
-        "p.g1 * p.k1 * u.v1 +",
-        "p.g1 * p.k1 * u.v1 * 100 +",
-        (("v1", "rate of h1"), ("input v1",)),
-        100,
-    ),
-    Mistake(
-        "quadruple_tank",
-        "sign",
-        "(1 - p.g2) * p.k2 * u.v2 - p.a34 * q[2]",
-        "(1 - p.g2) * p.k2 * u.v2 + p.a34 * q[2]",
-        (("rate of h3", SIGN),),
-    ),
-    # bioreactor
-    Mistake("bioreactor", "sign", "(mu - u.D) * x.X", "(mu + u.D) * x.X", (("D in the rate of X", SIGN),)),
-    Mistake("bioreactor", "sign", "- mu * x.X / p.Y", "+ mu * x.X / p.Y", (("rate of S", SIGN),)),
-    Mistake("bioreactor", "unit", "(mu - u.D) * x.X / 3600", "(mu - u.D) * x.X", (("rate of X",),), 3600),
-    Mistake(
-        "bioreactor",
-        "unit",
-        "(mu - u.D) * x.X / 3600, (u.D * (p.S_f - x.S) - mu * x.X / p.Y) / 3600",
-        "(mu - u.D) * x.X / 3600, (u.D * (p.S_f - x.S) - mu * x.X / p.Y) / 60",
-        (("rate of S",),),
-        60,
-    ),
-    # evaporator
-    Mistake(
-        "evaporator", "sign", "(w.F1 - f4 - u.F2)", "(w.F1 - f4 + u.F2)", (("F2 in the rate of L", SIGN),)
-    ),
-    Mistake("evaporator", "sign", "(f4 - f5)", "(f5 - f4)", (("rate of P", SIGN),)),
-    Mistake(
-        "evaporator",
-        "unit",
-        "(w.F1 - f4 - u.F2) / p.A / 60",
-        "(w.F1 - f4 - u.F2) / p.A",
-        (("rate of L",), ("output L",)),
-        60,
-    ),
-    Mistake("evaporator", "sign", "(w.F1 - f4 - u.F2)", "(w.F1 + f4 - u.F2)", (("rate of L", SIGN),)),
-    # column
-    Mistake(
-        "column",
-        "sign",
-        "(below - u.boil_up) * x.x_B - u.boil_up * y(x.x_B)",
-        "(below - u.boil_up) * x.x_B + u.boil_up * y(x.x_B)",
-        (("boil_up", "rate of x_B", SIGN),),
-    ),
-    Mistake("column", "swapped column", "inputs", "", (("inputs", "exchanged"),)),
-    Mistake(
-        "column",
-        "sign",
-        "u.boil_up * (y(x.x_2) - x.x_D)",
-        "u.boil_up * (x.x_D - y(x.x_2))",
-        (("rate of x_D", SIGN),),
-    ),
-    Mistake(
-        "column",
-        "unit",
-        "u.boil_up * (y(x.x_2) - x.x_D) / p.M_e / 60",
-        "u.boil_up * (y(x.x_2) - x.x_D) / p.M_e",
-        (("rate of x_D",),),
-        60,
-    ),
-    # building
-    Mistake("building", "sign", "p.H_mo * (x.T_m - w.T_o)", "p.H_mo * (x.T_m + w.T_o)", (("T_o", SIGN),)),
-    Mistake(
-        "building",
-        "sign",
-        "(flow - p.H_mo",
-        "(-flow - p.H_mo",
-        (("H_im * (T_i - T_m)", "rate of T_m", SIGN),),
-    ),
-    Mistake("building", "sign", "+ p.A_w * w.sun - flow", "- p.A_w * w.sun - flow", (("sun", SIGN),)),
-    Mistake("building", "unit", "(u.heat + p.A_w", "(1000 * u.heat + p.A_w", (("heat",),), 1000),
-    # flexible shaft
-    Mistake(
-        "flexible_shaft",
-        "sign",
-        "- shaft) / p.J_m",
-        "+ shaft) / p.J_m",
-        (("c * twist", "rate of motor", SIGN),),
-    ),
-    Mistake("flexible_shaft", "swapped column", "outputs", "", (("outputs", "exchanged"),)),
-    Mistake("flexible_shaft", "sign", "x.motor - x.load\n", "x.load - x.motor\n", (("rate of twist", SIGN),)),
-    Mistake(
-        "flexible_shaft",
-        "unit",
-        "shaft / p.J_l, x.motor - x.load",
-        "shaft / p.J_l, (x.motor - x.load) * 57.29578",
-        (("rate of twist",), ("twist in",)),
-        57.29578,
-    ),
-    # magnetic levitation
-    Mistake(
-        "magnetic_levitation",
-        "sign",
-        "9810.0 - p.k *",
-        "9810.0 + p.k *",
-        (("rate of gap_dot", SIGN), ("9810", SIGN)),
-    ),
-    Mistake("magnetic_levitation", "unit", "9810.0 - p.k", "9.81 - p.k", (("9.81",),), 0.001),
-    Mistake(
-        "magnetic_levitation",
-        "sign",
-        "(u.u - p.R * x.i)",
-        "(u.u + p.R * x.i)",
-        (("R * i", SIGN), ("input u", SIGN)),
-    ),
-    Mistake(
-        "magnetic_levitation",
-        "missing factor",
-        "x.gap_dot, 9810",
-        "0.001 * x.gap_dot, 9810",
-        (("gap_dot in the rate of gap:",),),
-        0.001,
-    ),
-    # inverted pendulum
-    Mistake(
-        "inverted_pendulum",
-        "angle",
-        "return p.m * G * p.l * ca.cos(q.phi)",
-        "return -p.m * G * p.l * ca.cos(q.phi)",
-        (("potential", SIGN), ("phi", "another zero")),
-    ),
-    Mistake(
-        "inverted_pendulum",
-        "sign",
-        "return u.F, 0.0",
-        "return -u.F, 0.0",
-        (("F", SIGN), ("output s", "other way"), ("output phi", "other way")),
-    ),
-    Mistake(
-        "inverted_pendulum",
-        "sign",
-        "c = p.m * p.l * ca.cos(q.phi)",
-        "c = -p.m * p.l * ca.cos(q.phi)",
-        (("(s, phi)", SIGN), ("output phi", "other way"), ("output s", "other way")),
-    ),
-    Mistake("inverted_pendulum", "swapped column", "outputs", "", (("outputs", "exchanged"), ("phi", "s"))),
-    # ship
-    Mistake(
-        "ship",
-        "sign",
-        "(u.delta - x.rudder)",
-        "(-u.delta - x.rudder)",
-        (("delta", SIGN), ("psi", "other way"), ("psi", SIGN)),
-    ),
-    Mistake(
-        "ship",
-        "unit",
-        "return x.r, (p.K",
-        "return x.r * 57.29578, (p.K",
-        (("rate of psi",), ("output psi",), ("input delta",), ("rate of r:",)),
-        57.29578,
-    ),
-    Mistake(
-        "ship",
-        "sign",
-        "x.r, (p.K * (x.rudder - p.bias) - x.r)",
-        "x.r, (p.K * (x.rudder - p.bias) + x.r)",
-        (("r in the rate of r", SIGN),),
-    ),
-    Mistake("ship", "sign", "(u.delta - x.rudder)", "(u.delta + x.rudder)", (("rudder", SIGN),)),
-    # ball and beam
-    Mistake(
-        "ball_and_beam",
-        "sign",
-        "-p.k * ca.sin(x.beam - p.off)",
-        "p.k * ca.sin(x.beam - p.off)",
-        (("rate of s_dot", SIGN), ("command", SIGN), ("output s", "other way")),
-    ),
-    Mistake(
-        "ball_and_beam",
-        "unit",
-        "ca.sin(x.beam - p.off)",
-        "ca.sin((x.beam - p.off) * 0.01745329)",
-        (("rate of s_dot",), ("s_dot in the rate of s",), ("output s",)),
-        1 / 57.29578,
-    ),
-    Mistake("ball_and_beam", "sign", "(u.command - x.beam)", "(u.command + x.beam)", (("beam", SIGN),)),
-    Mistake(
-        "ball_and_beam",
-        "unit",
-        "(u.command - x.beam)",
-        "(u.command * 57.29578 - x.beam)",
-        (("command",),),
-        57.29578,
-    ),
-    # hydraulic cylinder
-    Mistake(
-        "hydraulic_cylinder",
-        "sign",
-        "- p.b * x.s_dot) / p.m",
-        "+ p.b * x.s_dot) / p.m",
-        (("b * s_dot", SIGN),),
-    ),
-    Mistake(
-        "hydraulic_cylinder",
-        "sign",
-        "(flow - p.A * x.s_dot)",
-        "(flow + p.A * x.s_dot)",
-        (("s_dot", "p_L", SIGN),),
-    ),
-    Mistake("hydraulic_cylinder", "unit", "(1e5 * p.A * x.p_L", "(p.A * x.p_L", (("p_L",),), 1e-5),
-    Mistake(
-        "hydraulic_cylinder",
-        "unit",
-        "flow = p.k_q * u.u *",
-        "flow = 1000 * p.k_q * u.u *",
-        (("flow",), ("k_q",)),
-        1000,
-    ),
+    *(Mistake(name, *given) for name, mistakes in PLANTED.items() for given in mistakes),
 )
 HARMLESS = 1.1
 """Ratio of the fitted errors with and without a mistake up to which recordings cannot tell the mistake."""
@@ -450,17 +384,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for mistake in (one for one in MISTAKES if one.machine == name):
                 rows.append(judged(mistake, Path(folder), right))
                 print(rows[-1], flush=True)
-    print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
-    for row in rows:
-        print("| " + " | ".join(str(v).replace("|", "\\|") for v in row.values()) + " |")
+    report(rows, given.out)
     planted = [r for r in rows if not r["kind"].startswith("none")]
     sound = [r for r in rows if r["kind"].startswith("none")]
     print(
         f"\nplanted: {sum(r['right'] == 'yes' for r in planted)} of {len(planted)} named right; none: "
         f"{sum(r['right'] == 'yes' for r in sound)} of {len(sound)} left alone"
     )
-    if given.out is not None:
-        given.out.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

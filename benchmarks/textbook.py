@@ -25,26 +25,46 @@ TURNING: tuple[Signal, Signal] = (
 HANGING = OperatingPoint((0.0, 0.0), (0.0,))
 
 
-class DiskPrior(MechanicalPrior):
+class PendulumPrior(MechanicalPrior):
+    """``J phi'' = torque - mgl sin phi - d phi'``: a rigid pendulum with viscous friction.
+
+    Source: H. K. Khalil, *Nonlinear Systems*, 3rd edition (2002), section 1.2.1.
+    """
+
+    states: ClassVar[tuple[Signal, ...]] = TURNING
+    outputs: ClassVar[tuple[Signal, ...]] = (TURNING[0],)
+    operating_point: ClassVar[OperatingPoint | None] = HANGING
+
+    def mass_matrix(self, q: Any, p: Any) -> Any:
+        """Inertia about the axis [kg m^2]."""
+        return p.J
+
+    def potential(self, q: Any, p: Any) -> Any:
+        """Height of the pendulum [J]."""
+        return -p.mgl * ca.cos(q.phi)
+
+    def friction(self, q: Any, v: Any, p: Any) -> Any:
+        """Viscous friction [N m]."""
+        return p.d * v.phi_dot
+
+    def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
+        """The commanded torque [N m]."""
+        return u.torque
+
+
+class DiskPrior(PendulumPrior):
     """``phi'' = -w_0^2 sin phi - gamma phi' + K_u u``: a pendulum on a direct-current motor without inductance.
 
     Source: K. Ogata, *Modern Control Engineering*, 5th edition (2010), sections 3.3 and 3.4.
     """
 
-    states: ClassVar[tuple[Signal, ...]] = TURNING
     inputs: ClassVar[tuple[Signal, ...]] = (Signal("voltage", "V", -12.0, 12.0),)
-    outputs: ClassVar[tuple[Signal, ...]] = (TURNING[0],)
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("J", 2.44e-4, "kg m^2", 2.44e-4, 2.44e-4, "inertia (fixed: it shows in no motion)"),
         Parameter("w_0", 11.0, "rad/s", 5.0, 20.0, "natural frequency"),
         Parameter("gamma", 1.5, "1/s", 0.0, 20.0, "viscous friction and back-EMF over J"),
         Parameter("K_u", 28.0, "rad/s^2/V", 5.0, 100.0, "acceleration a volt"),
     )
-    operating_point: ClassVar[OperatingPoint | None] = HANGING
-
-    def mass_matrix(self, q: Any, p: Any) -> Any:
-        """Inertia about the axis [kg m^2]."""
-        return p.J
 
     def potential(self, q: Any, p: Any) -> Any:
         """Height of the weight [J]."""
@@ -87,7 +107,7 @@ class AxisPrior(MechanicalPrior):
         return u.force
 
 
-class ServoPrior(MechanicalPrior):
+class ServoPrior(PendulumPrior):
     """``J phi'' = e k_t / R (duty U - k_t phi') - mgl sin phi - d phi'``: a pendulum on a direct-current motor.
 
     ``e`` is 1 with the motor switched on and 0 without.
@@ -95,13 +115,11 @@ class ServoPrior(MechanicalPrior):
     Source: K. Ogata, *Modern Control Engineering*, 5th edition (2010), sections 3.3 and 3.4.
     """
 
-    states: ClassVar[tuple[Signal, ...]] = TURNING
     inputs: ClassVar[tuple[Signal, ...]] = (
         Signal("duty", "-", -1.0, 1.0),
         Signal("supply", "V", 0.0, 14.0),
         Signal("enabled", "-", 0.0, 1.0),
     )
-    outputs: ClassVar[tuple[Signal, ...]] = (TURNING[0],)
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("mgl", 0.4807, "N m", 0.4807, 0.4807, "largest gravity torque: 0.49 kg at 0.10 m (fixed)"),
         Parameter("J", 0.0065, "kg m^2", 0.003, 0.03, "inertia with the rotor's"),
@@ -111,28 +129,13 @@ class ServoPrior(MechanicalPrior):
     )
     operating_point: ClassVar[OperatingPoint] = OperatingPoint((0.0, 0.0), (0.0, 12.0, 1.0))
 
-    def mass_matrix(self, q: Any, p: Any) -> Any:
-        """Inertia about the axis [kg m^2]."""
-        return p.J
-
-    def potential(self, q: Any, p: Any) -> Any:
-        """Height of the weight [J]."""
-        return -p.mgl * ca.cos(q.phi)
-
-    def friction(self, q: Any, v: Any, p: Any) -> Any:
-        """Viscous friction [N m]."""
-        return p.d * v.phi_dot
-
     def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
         """Torque of the motor [N m]."""
         return u.enabled * p.k_t / p.R * (u.duty * u.supply - p.k_t * v.phi_dot)
 
 
-class TorquePrior(MechanicalPrior):
-    """``J phi'' = u - mgl sin phi - d phi'``: a rigid pendulum whose torque is commanded, with viscous friction.
-
-    Source: H. K. Khalil, *Nonlinear Systems*, 3rd edition (2002), section 1.2.1.
-    """
+class TorquePrior(PendulumPrior):
+    """A pendulum whose torque is commanded."""
 
     states: ClassVar[tuple[Signal, ...]] = (
         Signal("phi", "rad", -40.0, 40.0, periodic=True),
@@ -145,27 +148,10 @@ class TorquePrior(MechanicalPrior):
         Parameter("mgl", 3.0, "N m", 1.0, 8.0, "largest gravity torque"),
         Parameter("d", 0.01, "N m s/rad", 0.0, 0.5, "viscous friction"),
     )
-    operating_point: ClassVar[OperatingPoint | None] = HANGING
-
-    def mass_matrix(self, q: Any, p: Any) -> Any:
-        """Inertia about the axis [kg m^2]."""
-        return p.J
-
-    def potential(self, q: Any, p: Any) -> Any:
-        """Height of the rod [J]."""
-        return -p.mgl * ca.cos(q.phi)
-
-    def friction(self, q: Any, v: Any, p: Any) -> Any:
-        """Viscous friction [N m]."""
-        return p.d * v.phi_dot
-
-    def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
-        """Torque of the drive [N m]."""
-        return u.torque
 
 
-class ClubPrior(MechanicalPrior):
-    """``J phi'' = 4 u - m g a sin phi - d phi'``: the golf robot as a pendulum with viscous friction.
+class ClubPrior(PendulumPrior):
+    """``J phi'' = 4 u - mgl sin phi - d phi'``: the golf robot as a pendulum with viscous friction.
 
     Source: H. K. Khalil, *Nonlinear Systems*, 3rd edition (2002), section 1.2.1.
     """
@@ -178,22 +164,9 @@ class ClubPrior(MechanicalPrior):
     outputs: ClassVar[tuple[Signal, ...]] = (states[0],)
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("J", 0.1445, "kg m^2", 0.05, 0.4, "inertia about the axis"),
-        Parameter("mga", 2.4, "N m", 1.0, 5.0, "largest gravity torque"),
+        Parameter("mgl", 2.4, "N m", 1.0, 5.0, "largest gravity torque"),
         Parameter("d", 0.0132, "N m s/rad", 0.0, 0.5, "viscous damping"),
     )
-    operating_point: ClassVar[OperatingPoint | None] = HANGING
-
-    def mass_matrix(self, q: Any, p: Any) -> Any:
-        """Inertia about the axis [kg m^2]."""
-        return p.J
-
-    def potential(self, q: Any, p: Any) -> Any:
-        """Height of the club [J]."""
-        return -p.mga * ca.cos(q.phi)
-
-    def friction(self, q: Any, v: Any, p: Any) -> Any:
-        """Viscous friction [N m]."""
-        return p.d * v.phi_dot
 
     def force(self, q: Any, v: Any, u: Any, w: Any, p: Any) -> Any:
         """Motor torque at the club, with the gear's ratio of 4 [N m]."""

@@ -27,7 +27,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy is loaded
 
 import argparse
-import json
 import tempfile
 import time
 from collections.abc import Sequence
@@ -38,7 +37,7 @@ import numpy as np
 from scipy.stats import t as student
 from unknown.case_plants import case_plants
 from unknown.cases import Case, cases
-from unknown.common import Machine
+from unknown.common import Machine, report
 from unknown.loops import Made, Ran, made, ran, trials_of, tuned_rival
 from unknown.motion import MOTION
 from unknown.plants import PLANTS, Plant
@@ -160,12 +159,7 @@ def main() -> None:
                 continue
             rows.append(compared(case.name, plants[case.name], of_case(case, plants[case.name]), given.seeds))
             print(rows[-1], flush=True)
-    if rows:
-        print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
-        for row in rows:
-            print("| " + " | ".join(str(v) for v in row.values()) + " |")
-    if given.out is not None:
-        given.out.write_text(json.dumps(rows, indent=1) + "\n")
+    report(rows, given.out)
 
 
 if __name__ == "__main__":

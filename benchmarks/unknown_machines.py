@@ -16,7 +16,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy is loaded
 
 import argparse
-import json
 import tempfile
 import time
 import traceback
@@ -27,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from unknown.cases import Case, cases
-from unknown.common import Machine
+from unknown.common import Machine, report
 from unknown.coverage import MACHINES as SIMULATED
 from unknown.coverage import Simulated, cramer_rao
 from unknown.independent import Runs, cut, fit, free_run_errors
@@ -314,7 +313,7 @@ def random(given: argparse.Namespace) -> list[dict[str, Any]]:
     rows = []
     for seed in range(given.first, given.first + given.priors):
         rows.append(random_row(drawn(seed)))
-        print(json.dumps(rows[-1]), flush=True)
+        print(rows[-1], flush=True)
     found = []
     for name, own in (
         ("all", rows), ("stable", [r for r in rows if r["stable"]]), ("unstable", [r for r in rows if not r["stable"]])
@@ -355,12 +354,7 @@ def main() -> None:
     if given.priors is None:
         given.priors = 50 if given.what == "random" else 5
     rows = {"machines": machines, "coverage": coverage, "order": order, "random": random}[given.what](given)
-    if rows:
-        print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
-        for row in rows:
-            print("| " + " | ".join(str(v) for v in row.values()) + " |")
-    if given.out is not None:
-        given.out.write_text(json.dumps(rows, indent=1) + "\n")
+    report(rows, given.out)
 
 
 if __name__ == "__main__":

@@ -17,13 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nn_export.errors import (
-    DerivativeError,
-    ExportError,
-    ProgramError,
-    UnsupportedOperatorError,
-    last_line,
-)
+from nn_export.errors import DerivativeError, ExportError, ProgramError, UnsupportedOperatorError, last_line
 from nn_export.expressions import Step, scalar_steps
 
 MAX_WALK = 3000

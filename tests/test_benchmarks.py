@@ -48,7 +48,6 @@ def test_solvers_find_the_same_plan(tmp_path):
     [
         ("steps", "--z 4 --n 8"),
         ("training", "--z 4 --steps 10 --batch 4 --rounds 1"),
-        ("monitor_step", "--rounds 1"),
         ("whole_period", "--z 4"),
         ("replay", "--share 0.05 --only double"),
         ("studies", "scale --runs 50"),

@@ -1,8 +1,9 @@
-"""What all machines share: how a plant is run and recorded."""
+"""What all machines share: how they are recorded, and the table of a benchmark of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 from hybrid_mpc import DataSpec, Prior
 
 Array = NDArray[np.float64]
-Rates = Callable[[Array, Array, float], Array]
 
 
 @dataclass(frozen=True)
@@ -55,32 +55,6 @@ class Machine:
         return files
 
 
-def run(
-    rates: Rates,
-    x: Array,
-    control: Callable[[int, Array], Array],
-    measure: Callable[[Array], Array],
-    dt: float,
-    samples: int,
-    steps: int = 4,
-) -> tuple[Array, Array, Array]:
-    """Times, inputs and measured outputs of a plant ``rates(x, u, t)`` under ``control(k, y)``; RK4."""
-    t, h = dt * np.arange(samples), dt / steps
-    inputs, outputs = [], []
-    for k in range(samples):
-        y = measure(x)
-        u = np.atleast_1d(control(k, y))
-        inputs.append(u)
-        outputs.append(y)
-        for i in range(steps):
-            now = t[k] + i * h
-            k1 = rates(x, u, now)
-            k2 = rates(x + h / 2 * k1, u, now + h / 2)
-            k3 = rates(x + h / 2 * k2, u, now + h / 2)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3, u, now + h))
-    return t, np.array(inputs), np.array(outputs)
-
-
 def quantised(y: Array, steps: float | Array) -> Array:
     """What a converter with such steps gives."""
     return np.asarray(np.round(y / steps) * steps)
@@ -106,3 +80,13 @@ def levels(
         out[k : k + n] = rng.uniform(low, high)
         k += n
     return out
+
+
+def report(rows: Sequence[Mapping[str, object]], out: Path | None) -> None:
+    """Rows as a Markdown table, and as a JSON file."""
+    if rows:
+        print("\n| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
+    for row in rows:
+        print("| " + " | ".join(str(v).replace("|", "\\|") for v in row.values()) + " |")
+    if out is not None:
+        out.write_text(json.dumps(rows, indent=1) + "\n")

@@ -11,10 +11,9 @@ import casadi as ca
 import numpy as np
 
 from hybrid_mpc import DataSpec, MechanicalPrior, OperatingPoint, Parameter, Prior, Signal
-from unknown.common import Array, Machine, drop_outs, levels, quantised, run
-from unknown.plants import PLANTS
+from unknown.common import Array, Machine, drop_outs, levels, quantised
+from unknown.plants import PLANTS, run
 
-NONE: Array = np.zeros(0)
 """Measured disturbances of a machine without any."""
 
 G = 9.81
@@ -50,10 +49,7 @@ def flexible_shaft(seed: int) -> Array:
     n, dt, plant = 3000, 0.002, PLANTS["flexible_shaft"]
     volts = levels(rng, n, -8, 8, 20, 200)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
-    t, u, y = run(rates, np.array(plant.start), lambda k, y: volts[k : k + 1], plant.measure, dt, n, 2)
+    t, u, y = run(plant, lambda k, y: volts[k : k + 1], dt, n, 2)
     y = drop_outs(quantised(y + 0.2 * rng.standard_normal(y.shape), 0.1), rng, 0.02)
     return np.column_stack([t, u, y])
 
@@ -88,9 +84,6 @@ def magnetic_levitation(seed: int) -> Array:
     goal, push = levels(rng, n, 9.0, 11.0, 300, 900), levels(rng, n, -2.0, 2.0, 8, 60)
     memory = np.array([10.0, 0.0, 0.0])
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
     def control(k: int, y: Array) -> Array:
         last, speed, total = memory
         speed += 0.3 * ((y[0] - last) / dt - speed)
@@ -101,8 +94,8 @@ def magnetic_levitation(seed: int) -> Array:
 
     noise = iter(rng.standard_normal((2 * n, 2)) * [0.005, 0.004])
     t, u, y = run(
-        rates, np.array(plant.start), control,
-        lambda x: quantised(plant.measure(x) + next(noise), np.array([0.005, 0.002])), dt, n, 2,
+        plant, control, dt, n, 2,
+        measure=lambda x: quantised(plant.measure(x) + next(noise), np.array([0.005, 0.002])),
     )  # fmt: skip
     return np.column_stack([t, u, drop_outs(y, rng, 0.01)])
 
@@ -150,9 +143,6 @@ def cart_pole(seed: int) -> Array:
     goal, push = levels(rng, n, -0.5, 0.5, 200, 500), levels(rng, n, -2.0, 2.0, 10, 60)
     memory = np.zeros(4)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
     def control(k: int, y: Array) -> Array:
         speed = memory[2:] + 0.4 * ((y - memory[:2]) / dt - memory[2:])
         memory[:] = np.concatenate([y, speed])
@@ -164,7 +154,7 @@ def cart_pole(seed: int) -> Array:
             x[:2] + np.array([3e-4, 5e-4]) * rng.standard_normal(2), np.array([5e-4, 2 * np.pi / 4096])
         )
 
-    t, u, y = run(rates, np.array([0.0, 0.03, 0.0, 0.0]), control, measure, dt, n, 4)
+    t, u, y = run(plant, control, dt, n, 4, start=(0.0, 0.03, 0.0, 0.0), measure=measure)
     return np.column_stack([t, u, drop_outs(y, rng, 0.01)])
 
 
@@ -195,17 +185,16 @@ def ship(seed: int) -> Array:
     memory = [0.0, 0.0]
     waves = 0.02 * np.cumsum(rng.standard_normal(n)) * 0.05
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, waves[min(int(t), n - 1)][None], plant.p)
-
     def control(k: int, y: Array) -> Array:
         memory[1] += 0.3 * ((y[0] - memory[0]) / dt - memory[1])
         memory[0] = y[0]
         return np.clip(np.atleast_1d(1.0 * (goal[k] - y[0]) - 18.0 * memory[1] + push[k]), -30, 30)
 
     t, u, y = run(
-        rates, np.zeros(3), control, lambda x: quantised(x[:1] + 0.05 * rng.standard_normal(1), 0.1), dt, n, 4
-    )
+        plant, control, dt, n, 4, start=(0.0, 0.0, 0.0),
+        measure=lambda x: quantised(x[:1] + 0.05 * rng.standard_normal(1), 0.1),
+        w=lambda t: waves[min(int(t), n - 1)][None],
+    )  # fmt: skip
     return np.column_stack([t, u, drop_outs(y, rng, 0.03)])
 
 
@@ -234,23 +223,15 @@ def ball_and_beam(seed: int) -> Array:
     goal, push = levels(rng, n, -0.25, 0.25, 100, 250), levels(rng, n, -0.05, 0.05, 10, 50)
     memory = [0.0, 0.0]
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
     def control(k: int, y: Array) -> Array:
         memory[1] += 0.3 * ((y[0] - memory[0]) / dt - memory[1])
         memory[0] = y[0]
         return np.clip(np.atleast_1d(0.35 * (y[0] - goal[k]) + 0.4 * memory[1] + push[k]), -0.35, 0.35)
 
     t, u, y = run(
-        rates,
-        np.array([0.05, 0.0, 0.0, 0.0]),
-        control,
-        lambda x: quantised(x[:1] + 5e-4 * rng.standard_normal(1), 1e-3),
-        dt,
-        n,
-        4,
-    )
+        plant, control, dt, n, 4, start=(0.05, 0.0, 0.0, 0.0),
+        measure=lambda x: quantised(x[:1] + 5e-4 * rng.standard_normal(1), 1e-3),
+    )  # fmt: skip
     return np.column_stack([t, u, drop_outs(y, rng, 0.02)])
 
 
@@ -273,11 +254,7 @@ class HydraulicCylinder(Prior):
         """Flow through the valve by the root of its pressure drop."""
         drop = p.p_s - ca.tanh(u.u / 0.05) * x.p_L
         flow = p.k_q * u.u * ca.sqrt(ca.fmax(drop, 1e-3))
-        return (
-            x.s_dot,
-            (1e5 * p.A * x.p_L - p.b * x.s_dot) / p.m,
-            1000 * p.C * (flow - p.A * x.s_dot),
-        )
+        return (x.s_dot, (1e5 * p.A * x.p_L - p.b * x.s_dot) / p.m, 1000 * p.C * (flow - p.A * x.s_dot))
 
 
 def hydraulic_cylinder(seed: int) -> Array:
@@ -286,21 +263,13 @@ def hydraulic_cylinder(seed: int) -> Array:
     n, dt, plant = 3000, 0.005, PLANTS["hydraulic_cylinder"]
     goal, push = levels(rng, n, -0.15, 0.15, 150, 500), levels(rng, n, -1.5, 1.5, 10, 60)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
     def control(k: int, y: Array) -> Array:
         return np.clip(np.atleast_1d(40.0 * (goal[k] - y[0]) + push[k]), -10, 10)
 
     t, u, y = run(
-        rates,
-        np.zeros(4),
-        control,
-        lambda x: quantised(x[:1] + 5e-5 * rng.standard_normal(1), 1e-4),
-        dt,
-        n,
-        10,
-    )
+        plant, control, dt, n, 10, start=(0.0, 0.0, 0.0, 0.0),
+        measure=lambda x: quantised(x[:1] + 5e-5 * rng.standard_normal(1), 1e-4),
+    )  # fmt: skip
     return np.column_stack([t, u, drop_outs(y, rng, 0.01)])
 
 

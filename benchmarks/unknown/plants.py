@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -48,6 +48,42 @@ class Plant:
         return SimpleNamespace(**self.parameters)
 
 
+NONE: Array = np.zeros(0)
+
+
+def run(
+    plant: Plant,
+    control: Callable[[int, Array], Array],
+    dt: float,
+    samples: int,
+    steps: int,
+    *,
+    start: Sequence[float] | None = None,
+    measure: Callable[[Array], Array] | None = None,
+    w: Callable[[float], Array] = lambda t: NONE,
+) -> tuple[Array, Array, Array]:
+    """Times, inputs and measured outputs of a plant under ``control(k, y)`` with disturbances ``w(t)``; RK4."""
+    x, measure, p = np.array(plant.start if start is None else start), measure or plant.measure, plant.p
+    t, h = dt * np.arange(samples), dt / steps
+    inputs, outputs = [], []
+
+    def rates(x: Array, u: Array, now: float) -> Array:
+        return plant.rates(x, u, w(now), p)
+
+    for k in range(samples):
+        y = measure(x)
+        u = np.atleast_1d(control(k, y))
+        inputs.append(u)
+        outputs.append(y)
+        for i in range(steps):
+            now = t[k] + i * h
+            k1 = rates(x, u, now)
+            k2 = rates(x + h / 2 * k1, u, now + h / 2)
+            k3 = rates(x + h / 2 * k2, u, now + h / 2)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3, u, now + h))
+    return t, np.array(inputs), np.array(outputs)
+
+
 def exchanger_rates(x: Array, u: Array, w: Array, p: Any) -> Array:
     """Cells on either side of walls that store heat; heat transfer grows with the flow."""
     m = CELLS
@@ -90,12 +126,7 @@ def evaporator_rates(x: Array, u: Array, w: Array, p: Any) -> Array:
     f5 = ua * (0.507 * pressure + 55.0 - 25.0)
     return (
         np.array(
-            [
-                (f1 - f4 - u[0]) / p.A,
-                (f1 * 5.0 - u[0] * conc) / p.M,
-                (f4 - f5) / p.C,
-                (u[1] - lag) / p.T,
-            ]
+            [(f1 - f4 - u[0]) / p.A, (f1 * 5.0 - u[0] * conc) / p.M, (f4 - f5) / p.C, (u[1] - lag) / p.T]
         )
         / 60
     )

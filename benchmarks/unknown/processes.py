@@ -11,10 +11,9 @@ import casadi as ca
 import numpy as np
 
 from hybrid_mpc import DataSpec, OperatingPoint, Parameter, Prior, Signal
-from unknown.common import Array, Machine, drop_outs, levels, quantised, run
-from unknown.plants import PLANTS
+from unknown.common import Array, Machine, drop_outs, levels, quantised
+from unknown.plants import PLANTS, run
 
-NONE: Array = np.zeros(0)
 """Measured disturbances of a machine without any."""
 
 
@@ -53,10 +52,7 @@ def heat_exchanger(seed: int) -> Array:
     n, dt, plant = 1500, 1.0, PLANTS["heat_exchanger_2"]
     flows = np.stack([levels(rng, n, 2, 9, 30, 150), levels(rng, n, 2, 9, 30, 150)], 1)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
-    t, u, y = run(rates, np.array(plant.start), lambda k, y: flows[k], plant.measure, dt, n, 8)
+    t, u, y = run(plant, lambda k, y: flows[k], dt, n, 8)
     y = drop_outs(quantised(y + 0.1 * rng.standard_normal(y.shape), 0.1), rng, 0.02)
     return np.column_stack([t, u, y])
 
@@ -94,10 +90,7 @@ def quadruple_tank(seed: int) -> Array:
     n, dt, plant = 1200, 2.0, PLANTS["quadruple_tank"]
     volts = np.stack([levels(rng, n, 2, 6, 30, 120), levels(rng, n, 2, 6, 30, 120)], 1)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
-    t, u, y = run(rates, np.array(plant.start), lambda k, y: volts[k], plant.measure, dt, n, 4)
+    t, u, y = run(plant, lambda k, y: volts[k], dt, n, 4)
     y = drop_outs(quantised(y + 1e-3 * rng.standard_normal(y.shape), 5e-4), rng, 0.03, 10)
     return np.column_stack([t, u, y])
 
@@ -128,10 +121,7 @@ def bioreactor(seed: int) -> Array:
     n, dt, plant = 720, 600.0, PLANTS["bioreactor"]
     feed = levels(rng, n, 0.05, 0.34, 18, 72)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, NONE, plant.p)
-
-    t, u, y = run(rates, np.array(plant.start), lambda k, y: feed[k : k + 1], plant.measure, dt, n, 4)
+    t, u, y = run(plant, lambda k, y: feed[k : k + 1], dt, n, 4)
     y = drop_outs(quantised(y + 0.05 * rng.standard_normal(y.shape), 0.02), rng, 0.05)
     return np.column_stack([t / 3600, u, y])
 
@@ -162,11 +152,7 @@ class Evaporator(Prior):
         t2 = 0.5616 * x.P + 0.3126 * x.X + 48.43
         f4 = p.UA * (0.1538 * u.steam + 90.0 - t2)
         f5 = p.k * u.F200 * (0.507 * x.P + 55.0 - 25.0) * 0.07
-        return (
-            (w.F1 - f4 - u.F2) / p.A / 60,
-            (w.F1 * p.X1 - u.F2 * x.X) / p.M / 60,
-            (f4 - f5) / p.C / 60,
-        )
+        return ((w.F1 - f4 - u.F2) / p.A / 60, (w.F1 * p.X1 - u.F2 * x.X) / p.M / 60, (f4 - f5) / p.C / 60)
 
 
 def evaporator(seed: int) -> Array:
@@ -180,9 +166,6 @@ def evaporator(seed: int) -> Array:
     )
     goal, memory = levels(rng, n, 0.8, 1.3, 150, 400), [0.0]
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, feed[min(int(t / dt), n - 1)][None], plant.p)
-
     def control(k: int, y: Array) -> Array:
         off = y[0] - goal[k]
         memory[0] += 0.02 * off
@@ -191,14 +174,10 @@ def evaporator(seed: int) -> Array:
     noise = rng.standard_normal((2 * n, 2)) * [0.01, 0.3]
     count = iter(noise)
     t, u, y = run(
-        rates,
-        np.array(plant.start),
-        control,
-        lambda x: quantised(plant.measure(x) + next(count), np.array([0.005, 0.1])),
-        dt,
-        n,
-        3,
-    )
+        plant, control, dt, n, 3,
+        measure=lambda x: quantised(plant.measure(x) + next(count), np.array([0.005, 0.1])),
+        w=lambda t: feed[min(int(t / dt), n - 1)][None],
+    )  # fmt: skip
     return np.column_stack([t, u, feed + 0.05 * rng.standard_normal(n), drop_outs(y, rng, 0.01)])
 
 
@@ -239,18 +218,10 @@ def column(seed: int) -> Array:
     reflux, feed = levels(rng, n, 2.4, 3.0, 30, 150), levels(rng, n, 0.45, 0.55, 80, 300)
     boil = reflux + levels(rng, n, 0.4, 0.6, 40, 200)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
-        return plant.rates(x, u, feed[min(int(t / dt), n - 1)][None], plant.p)
-
     t, u, y = run(
-        rates,
-        np.array(plant.start),
-        lambda k, y: np.array([reflux[k], boil[k]]),
-        plant.measure,
-        dt,
-        n,
-        4,
-    )
+        plant, lambda k, y: np.array([reflux[k], boil[k]]), dt, n, 4,
+        w=lambda t: feed[min(int(t / dt), n - 1)][None],
+    )  # fmt: skip
     y = drop_outs(quantised(y + 2e-3 * rng.standard_normal(y.shape), 1e-3), rng, 0.02)
     return np.column_stack([t, u, feed, y])
 
@@ -292,11 +263,11 @@ def building(seed: int) -> Array:
     )
     power = levels(rng, n, 0.0, 7.0, 12, 60)
 
-    def rates(x: Array, u: Array, t: float) -> Array:
+    def weather(t: float) -> Array:
         k = min(int(t / dt), n - 1)
-        return plant.rates(x, u, np.array([outside[k], sun[k]]), plant.p)
+        return np.array([outside[k], sun[k]])
 
-    t, u, y = run(rates, np.array(plant.start), lambda k, y: power[k : k + 1], plant.measure, dt, n, 8)
+    t, u, y = run(plant, lambda k, y: power[k : k + 1], dt, n, 8, w=weather)
     y = drop_outs(quantised(y + 0.05 * rng.standard_normal(y.shape), 0.0625), rng, 0.03, 12)
     return np.column_stack([t, u, outside + 0.1 * rng.standard_normal(n), sun, y])
 

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.embedded.layers import Layer, split, written_out
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.embedded.scalar import scalar_code
 from hybrid_mpc.model.model import HybridModel, inlined
-from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
 
@@ -105,10 +104,14 @@ def _gru(model: HybridModel, of: str, point: list[ca.MX], z_next: ca.MX, call: c
     first = _place(model, point, hidden)
     if first is None:
         return None
+    before = ca.Function("features", point, [ca.densify(seen)])
+    after = ca.Function(of, [*point, units], [ca.densify(behind)])
+    what = f"model {model.name}: its"
     found = Cut(
-        _scalar(model, "features", point, seen), Cell(*_weights(call.which_function()), first),
-        _scalar(model, of, [*point, units], behind),
-    )  # fmt: skip
+        scalar_code(f"{what} features", before),
+        Cell(*_weights(call.which_function()), first),
+        scalar_code(f"{what} {of}", after),
+    )
     parts = (found.before, found.after)
     # maximum scalar operations before or behind a GRU cell; with more, all networks are exported as layers
     if max(f.n_instructions() for f in parts if f is not None) > 10_000:
@@ -130,16 +133,6 @@ def next_places(z_next: ca.SX, units: ca.SX) -> dict[int, int]:
     """Entries of a step that equal a unit of the cell: number of the unit by index of the entry."""
     pairs = ((i, k) for i in range(z_next.numel()) for k in range(units.numel()))
     return {i: k for i, k in pairs if ca.is_equal(z_next[i], units[k], 0)}
-
-
-def _scalar(model: HybridModel, name: str, point: list[ca.MX], value: ca.MX) -> ca.Function:
-    f = ca.Function(name, point, [ca.densify(value)])
-    try:
-        return f.expand()
-    except RuntimeError as error:
-        raise InputError(
-            f"model {model.name}: its {name} cannot be written as scalar code: {last_line(error)} [HM-EMBEDDED-001]"
-        ) from error
 
 
 def _place(model: HybridModel, point: list[ca.MX], hidden: ca.MX) -> int | None:

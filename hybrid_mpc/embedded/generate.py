@@ -18,7 +18,7 @@ from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.control.targets import Targets
 from hybrid_mpc.embedded.cut import Cut, cut, next_places, reduced
 from hybrid_mpc.embedded.layers import after_code, layer_code
-from hybrid_mpc.embedded.scalar import c_function, comment, number, table
+from hybrid_mpc.embedded.scalar import c_function, comment, number, scalar_code, table
 from hybrid_mpc.embedded.watch import (
     NOTHING,
     Watched,
@@ -37,7 +37,6 @@ from hybrid_mpc.model import equilibrium
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
 from hybrid_mpc.watch.monitor import Monitor
-from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
 CORE = ("hmpc_model.c", "hmpc_qp.c", "hmpc_targets.c", "hmpc_mpc.c", "hmpc_estimator.c")
@@ -217,7 +216,7 @@ def _refused(
 def _curved(model: HybridModel) -> bool:
     """Whether the outputs' slopes by state and input are not constant: they depend on state, input or disturbances."""
     point = [ca.SX.sym(name, n) for name, n in (("x", model.n_x), ("u", model.n_u), ("w", model.n_w))]
-    y = _scalar("the output", model.output)(*point, ca.DM(model.p))
+    y = scalar_code("controller: the output", model.output)(*point, ca.DM(model.p))
     return bool(ca.depends_on(ca.jacobian(y, ca.vertcat(*point[:2])), ca.vertcat(*point)))
 
 
@@ -382,7 +381,7 @@ def _expressions(
     if soft.functions:
         values, e = [], ca.vertcat(d, w, p)
         for f in soft.functions:
-            values.append(_scalar(f"soft bound {f.name()}", f)(x, u, e))
+            values.append(scalar_code(f"controller: soft bound {f.name()}", f)(x, u, e))
         value = ca.densify(ca.vertcat(*values))
         outs = [(f"value[{i}]", value[i]) for i in range(value.numel())]
         for name, by, width in (("by_x", x, n_x), ("by_u", u, n_u)):
@@ -398,7 +397,7 @@ def _expressions(
         ]
         add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d, "p": p}, outs)
     if asked["MODES"] or ocp.n_y:
-        y = ca.densify(_scalar("the output", model.output)(x, u, w, ca.DM(model.p)))
+        y = ca.densify(scalar_code("controller: the output", model.output)(x, u, w, ca.DM(model.p)))
         outs = [(f"y[{i}]", y[i]) for i in range(model.n_y)]
         given, read = {"x": x, "u": u, "w": w}, ["const real *x", "const real *u", "const real *w"]
         add("outputs", [*read, "real *y"], given, outs)
@@ -410,7 +409,7 @@ def _expressions(
     if asked["STAGE_COST"] and problem.economic.function is not None:
         y_ref, both = ca.SX.sym("y", ocp.n_y), ca.vertcat(x, u)
         known = ca.vertcat(p, y_ref, d, w) if ocp.n_y else p[: problem.economic.n_p]
-        f = _scalar("the stage cost", problem.economic.function)
+        f = scalar_code("controller: the stage cost", problem.economic.function)
         cost = model.dt * ca.densify(f(x, u, known) if f.n_in() > 2 else f(x, u))
         by = ca.densify(ca.jacobian(cost, both))
         curve = ca.densify(ca.jacobian(by, both))
@@ -421,23 +420,14 @@ def _expressions(
         outs += [(f"curve[{i * n + j}]", curve[i, j]) for i in range(n) for j in range(i + 1)]
         add("stage_cost_slopes", [*read, "real *slope", "real *curve"], given, outs)
     if fallback is not None:
-        rates = _scalar("the prior", fallback.xdot)(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
+        prior = scalar_code("controller: the prior", fallback.xdot)
+        rates = prior(x, ca.DM.zeros(fallback.n_h), u, w, ca.DM(fallback.p))
         best = equilibrium.holding(rates, u, fallback.u0, Sizes(fallback, ocp).states, ocp.input_scale)
         outs = [(f"best[{i}]", best[i]) for i in range(n_u)]
         add("equilibrium", ["const real *x", "const real *w", "real *best"], {"x": x, "w": w}, outs)
     guard = "HMPC_EXPRESSIONS_H"
     opening = f"/* Scalar code of this controller, generated. */\n#ifndef {guard}\n#define {guard}\n"
     return opening + "\n".join([*texts, watched]) + "\n#endif\n", sizes, operations
-
-
-def _scalar(what: str, f: ca.Function) -> ca.Function:
-    try:
-        return f.expand()
-    except RuntimeError as error:
-        raise InputError(
-            f"controller: the C export is not possible, because {what} cannot be written as scalar code: "
-            f"{last_line(error)} [HM-EMBEDDED-006]"
-        ) from error
 
 
 def target_starts(own: Targets | None) -> Array:

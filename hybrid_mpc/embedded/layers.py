@@ -11,9 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.embedded.scalar import SMALL, c_function, table
-from hybrid_mpc.errors import InputError
-from nn_export.errors import last_line
+from hybrid_mpc.embedded.scalar import SMALL, c_function, scalar_code, table
 
 Array = NDArray[np.float64]
 
@@ -65,18 +63,9 @@ def split(point: Sequence[ca.MX], value: ca.MX, what: str) -> tuple[tuple[Layer,
     parts = [m[int(a) : int(b)] for a, b in pairwise(ends)]
     results = ca.graph_substitute([*seen, after], given, parts) if given else [after]
     for weight, own in zip(weights, results[:-1], strict=True):
-        layers.append(Layer(weight, _scalar(what, [*point, m], own)))
-    return tuple(layers), _scalar(what, [*point, m], results[-1])
-
-
-def _scalar(what: str, given: Sequence[ca.MX], value: ca.MX) -> ca.Function:
-    f = ca.Function("layer", list(given), [ca.densify(value)])
-    try:
-        return f.expand()
-    except RuntimeError as error:
-        raise InputError(
-            f"{what}: it cannot be written as scalar code: {last_line(error)} [HM-EMBEDDED-007]"
-        ) from error
+        layers.append(Layer(weight, scalar_code(what, ca.Function("layer", [*point, m], [ca.densify(own)]))))
+    last = ca.Function("after", [*point, m], [ca.densify(results[-1])])
+    return tuple(layers), scalar_code(what, last)
 
 
 def written_out(point: Sequence[ca.MX], value: ca.MX, but: str = "\0") -> ca.MX:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybrid_mpc.errors import InputError
+from nn_export.errors import last_line
 
 MOST = 30_000
 """Maximum operations of an expression that is exported as scalar code."""
@@ -37,6 +38,17 @@ _LIBM = {
 }  # fmt: skip
 """Functions of the C library; their last bits differ between libraries."""
 _NAMES = {code: name for name, code in vars(ca).items() if name.startswith("OP_")}
+
+
+def scalar_code(what: str, f: ca.Function) -> ca.Function:
+    """A function as scalar code; InputError if it calls what has none, e.g. a solver."""
+    try:
+        return f.expand()
+    except RuntimeError as error:
+        raise InputError(
+            f"{what}: the C export is not possible, because this cannot be written as scalar code: {last_line(error)}"
+            " [HM-EMBEDDED-006]"
+        ) from error
 
 
 def number(value: float) -> str:

@@ -14,15 +14,13 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController
 from hybrid_mpc.embedded.cut import Cut, cut, reduced
 from hybrid_mpc.embedded.layers import layer_code, tables_of
-from hybrid_mpc.embedded.scalar import c_function, table
-from hybrid_mpc.errors import InputError
+from hybrid_mpc.embedded.scalar import c_function, scalar_code, table
 from hybrid_mpc.loop.guard import TINY, Guard, Mode
 from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.watch.detector import CAP
 from hybrid_mpc.watch.energy import HELD_SHARE, EnergyReadings, energy_balance, inertia_of, weights
 from hybrid_mpc.watch.monitor import Monitor
 from hybrid_mpc.watch.residuals import ResidualReadings
-from nn_export.errors import last_line
 
 Array = NDArray[np.float64]
 KINDS = {EnergyReadings: 1, ResidualReadings: 2}
@@ -179,16 +177,6 @@ def _symbols(model: HybridModel) -> dict[str, ca.SX]:
     return {name: ca.SX.sym(name, n) for name, n in sizes.items()}
 
 
-def _scalar(what: str, given: list[ca.MX], value: ca.MX) -> ca.Function:
-    try:
-        return ca.Function("watched", given, [value]).expand()
-    except RuntimeError as error:
-        raise InputError(
-            f"monitor: the C export is not possible, because {what} cannot be written as scalar code: "
-            f"{last_line(error)} [HM-EMBEDDED-010]"
-        ) from error
-
-
 def _energy(readings: EnergyReadings, model: HybridModel, parts: Cut) -> Watched:
     window, n_q, dt = readings.window, model.n_x // 2, model.dt
     sizes = {"RATES": 1, "WINDOW": window, "FREE_RUN": readings.layout.length}
@@ -203,8 +191,10 @@ def _energy(readings: EnergyReadings, model: HybridModel, parts: Cut) -> Watched
     s = _symbols(model)
     x, u, w = (ca.MX.sym(name, v.numel()) for name, v in s.items())
     rate = ca.MX.sym("rate", model.n_x)
-    balance = _scalar("the energy balance", [x, rate, u, w], energy_balance(model, x, rate, ca.vertcat(u, w)))
-    inertia = _scalar("the inertia", [x, u, w], inertia_of(model, x, ca.vertcat(u, w)))
+    own = energy_balance(model, x, rate, ca.vertcat(u, w))
+    balance = scalar_code("monitor: its energy balance", ca.Function("watched", [x, rate, u, w], [own]))
+    inertia = ca.Function("watched", [x, u, w], [inertia_of(model, x, ca.vertcat(u, w))])
+    inertia = scalar_code("monitor: its inertia", inertia)
     r, a = ca.SX.sym("rate", model.n_x), ca.SX.sym("a", n_q)
     point = {"x": s["x"], "u": s["u"], "w": s["w"]}
     value, f = balance(s["x"], r, s["u"], s["w"]), ca.densify(inertia(*point.values()) @ a)
@@ -272,7 +262,7 @@ def _residuals(readings: ResidualReadings, model: HybridModel) -> Watched:
         x, u, w = (ca.MX.sym(name, v.numel()) for name, v in s.items())
         rate, none = ca.MX.sym("r", model.n_x), ca.MX.zeros(model.n_x)
         rows = [b.residual(x, rate, u, w, model.p) - b.residual(x, none, u, w, model.p) for b in names]
-        f = _scalar("a balance", [x, rate, u, w], ca.vertcat(*rows))
+        f = scalar_code("monitor: a balance", ca.Function("watched", [x, rate, u, w], [ca.vertcat(*rows)]))
         values = ca.densify(f(s["x"], r, s["u"], s["w"]))
         arguments = [*(f"const real *{key}" for key in "xruw"), "real *violation"]
         results = [(f"violation[{i}]", values[i]) for i in range(values.numel())]

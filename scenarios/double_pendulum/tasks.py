@@ -72,10 +72,7 @@ def stood(result: ClosedLoopResult) -> dict[str, float]:
 
 def pushes(driven: str, other: str) -> tuple[Fault, ...]:
     """A push at either joint, as long as those recorded."""
-    return (
-        Fault(1.0, 1.3, "input_offset", PUSHED, other),
-        Fault(2.5, 2.8, "input_offset", -PUSHED, driven),
-    )
+    return (Fault(1.0, 1.3, "input_offset", PUSHED, other), Fault(2.5, 2.8, "input_offset", -PUSHED, driven))
 
 
 TASKS = (

@@ -118,16 +118,7 @@ EXPERIMENT = Experiment(
     measured=True,
     shown="test_01_sine",
     efforts={
-        "quick": Effort(
-            4,
-            (3, 6),
-            steps=120,
-            free_run_steps=20,
-            valid=2,
-            test=3,
-            every=40,
-            decay=300.0,
-        ),
+        "quick": Effort(4, (3, 6), steps=120, free_run_steps=20, valid=2, test=3, every=40, decay=300.0),
         "full": Effort(16, (3, 6, 9, 12, 15), steps=1500, free_run_steps=200, valid=6, test=15, decay=300.0),
     },
     claims=(*claims("a", 0.23, 0.38, 0.46), *claims("b", 0.59, 0.29, 0.42)),

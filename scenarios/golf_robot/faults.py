@@ -60,11 +60,3 @@ def catalogue(start: float = 2.0, end: float = inf, drift_time: float = 60.0) ->
         one("friction_ageing_up", "Friction drifts up by 10 %", "plant_friction", 1.1, drift_time),
         one("friction_ageing_down", "Friction drifts down by 10 %", "plant_friction", 0.9, drift_time),
     )
-
-
-def fault_case(name: str, start: float = 2.0, end: float = inf) -> FaultCase:
-    """The case of that name."""
-    cases = {case.name: case for case in catalogue(start, end)}
-    if name not in cases:
-        raise InputError(f"golf_robot: no fault {name!r}; there are: {', '.join(cases)} [HM-SCENARIOS-008]")
-    return cases[name]

@@ -150,11 +150,7 @@ def step_class(form: str) -> type[RecurrentStep]:
 
 
 def fit_job(
-    scenario: str,
-    train: Sequence[Trajectory],
-    valid: Sequence[Trajectory],
-    path: Path,
-    report: Progress,
+    scenario: str, train: Sequence[Trajectory], valid: Sequence[Trajectory], path: Path, report: Progress
 ) -> None:
     """Fit the prior to one amount of training data and smooth by it, as the main job does."""
     from hybrid_mpc.identify.fit import fit_prior, smoothed

@@ -247,10 +247,7 @@ def fit_stage(work: Work) -> None:
         key = case_key(data_set, count, "prior")
         train = work.trajectories(data_set, "train", count)
         valid = work.trajectories(data_set, "valid", work.effort.valid)
-        jobs[key] = (
-            fit_job,
-            (work.settings.scenario, train, valid, work.folder / key),
-        )
+        jobs[key] = (fit_job, (work.settings.scenario, train, valid, work.folder / key))
     work.run(jobs)
     for key in jobs:
         for warning in read_json(work.folder / f"{key}.json")["warnings"]:

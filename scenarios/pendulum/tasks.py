@@ -15,14 +15,7 @@ Array = NDArray[np.float64]
 # Bryson's rule: one over the square of the largest deviation that is tolerable: 10 mrad, 0.5 rad/s, 5 N m of change per
 # period. Torque that a reference needs is no deviation; its weight (100 N m) only keeps the problem regular. Half a
 # second ahead is five of the pendulum's time constants (2 m l^2 / d = 96 ms). 20 N m is what the data reach.
-CONTROL = OCP(
-    horizon=50,
-    q=(1e4, 4.0),
-    r=(1e-4,),
-    r_delta=(0.04,),
-    u_min=(-20.0,),
-    u_max=(20.0,),
-)
+CONTROL = OCP(horizon=50, q=(1e4, 4.0), r=(1e-4,), r_delta=(0.04,), u_min=(-20.0,), u_max=(20.0,))
 
 STEPS = (0.0, 0.5, -0.4, 0.6, 0.0)
 STEP_TIME = 0.8

@@ -10,20 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import (
-    OCP,
-    DataSpec,
-    Disturbance,
-    Fault,
-    MechanicalPrior,
-    OperatingPoint,
-    Parameter,
-    Scenario,
-    Signal,
-    Task,
-    multisine,
-    random_steps,
-)  # fmt: skip
+import hybrid_mpc as hm
 from scenarios.common import moves
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 
@@ -32,23 +19,23 @@ DT, SECONDS, GRAVITY = 0.02, 20.0, 9.81
 REST = (0.0, 0.0, 0.0, 0.0)
 
 
-class CartPolePrior(MechanicalPrior):
+class CartPolePrior(hm.MechanicalPrior):
     """A cart on a rail with viscous friction, and a point mass on a rod that hangs from it; angle 0 hangs down."""
 
-    states: ClassVar[tuple[Signal, ...]] = (
-        Signal("position", "m", -3.0, 3.0), Signal("angle", "rad", -20.0, 20.0),
-        Signal("speed", "m/s", -10.0, 10.0), Signal("angle_rate", "rad/s", -30.0, 30.0),
+    states: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("position", "m", -3.0, 3.0), hm.Signal("angle", "rad", -20.0, 20.0),
+        hm.Signal("speed", "m/s", -10.0, 10.0), hm.Signal("angle_rate", "rad/s", -30.0, 30.0),
     )  # fmt: skip
-    inputs: ClassVar[tuple[Signal, ...]] = (Signal("force", "N", -15.0, 15.0),)
-    outputs: ClassVar[tuple[Signal, ...]] = states[:2]
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("M", 1.0, "kg", 0.4, 2.0, "mass of the cart"),
-        Parameter("m", 0.3, "kg", 0.1, 0.8, "mass of the pole"),
-        Parameter("l", 0.5, "m", 0.25, 1.0, "length of the pole"),
-        Parameter("b", 2.0, "N s/m", 0.0, 10.0, "viscous friction of the rail"),
-        Parameter("d", 0.01, "N m s/rad", 0.0, 0.1, "friction of the pole's bearing"),
+    inputs: ClassVar[tuple[hm.Signal, ...]] = (hm.Signal("force", "N", -15.0, 15.0),)
+    outputs: ClassVar[tuple[hm.Signal, ...]] = states[:2]
+    parameters: ClassVar[tuple[hm.Parameter, ...]] = (
+        hm.Parameter("M", 1.0, "kg", 0.4, 2.0, "mass of the cart"),
+        hm.Parameter("m", 0.3, "kg", 0.1, 0.8, "mass of the pole"),
+        hm.Parameter("l", 0.5, "m", 0.25, 1.0, "length of the pole"),
+        hm.Parameter("b", 2.0, "N s/m", 0.0, 10.0, "viscous friction of the rail"),
+        hm.Parameter("d", 0.01, "N m s/rad", 0.0, 0.1, "friction of the pole's bearing"),
     )
-    operating_point: ClassVar[OperatingPoint] = OperatingPoint(REST, (0.0,))
+    operating_point: ClassVar[hm.OperatingPoint] = hm.OperatingPoint(REST, (0.0,))
 
     def mass_matrix(self, q: Any, p: Any) -> Any:
         """Inertia: of both masses along the rail [kg], coupling [kg m], of the pole [kg m^2]."""
@@ -102,7 +89,7 @@ class CartPole(SimulatedPlant):
 def signals(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Force: random steps and a multisine of random start."""
     late = rng.uniform(0.0, SECONDS)
-    u = random_steps(t, -6.0, 6.0, hold=(0.2, 1.2), rng=rng) + multisine(
+    u = hm.random_steps(t, -6.0, 6.0, hold=(0.2, 1.2), rng=rng) + hm.multisine(
         t + late, 2.5, 0.2, 2.0, period=SECONDS
     )
     return u[:, None], np.zeros((len(t), 0))
@@ -134,25 +121,25 @@ def aside(t: Array) -> Array:
     return np.column_stack([moves(t, (0.0, 0.4), 0.5, 1.0)[:, 0], np.zeros(len(t))])
 
 
-scenario = Scenario(
+scenario = hm.Scenario(
     name="cart_pole",
     title="Cart with a hanging pole: one force, two positions, a rail that sticks (simulated)",
     description="A force moves a cart from which a pole hangs. The prior's rail has viscous friction; the machine's "
     "rail also sticks. Recordings are held on the rail by a weak spring.",
     prior=CartPolePrior,
-    data=DataSpec("time_s", ("force_n",), ("position_m", "angle_rad"), dt=DT, max_gap=2 * DT, smoothing=0.14,
+    data=hm.DataSpec("time_s", ("force_n",), ("position_m", "angle_rad"), dt=DT, max_gap=2 * DT, smoothing=0.14,
                   warm_up=0.5, windows=windows(SECONDS), free_run=3.0),
     make_data=make_data,
     plant=CartPole,
     # 2 cm and 2 m/s of the cart, 2 rad/s of the pole, 2 N a period; a second and a half is one swing of the pole
-    control=OCP(75, q=(0.0, 0.0, 0.25, 0.25), r=(1e-3,), r_delta=(0.25,), u_min=(-15.0,), u_max=(15.0,),
+    control=hm.OCP(75, q=(0.0, 0.0, 0.25, 0.25), r=(1e-3,), r_delta=(0.25,), u_min=(-15.0,), u_max=(15.0,),
                 q_y=(2500.0, 0.0)),
     sensor_sigma=(5e-4, 1e-3),
     safe_input=(0.0,),
-    disturbance_model=(Disturbance("input", "force"), Disturbance("output", "angle", 0.05)),
+    disturbance_model=(hm.Disturbance("input", "force"), hm.Disturbance("output", "angle", 0.05)),
     tasks=(
-        Task("move", "Move the cart, keep the pole from swinging", 8.0, REST, moved),
-        Task("push", "Hold a place against an unknown force", 8.0, REST, aside,
-             faults=(Fault(3.0, np.inf, "input_offset", -2.0),)),
+        hm.Task("move", "Move the cart, keep the pole from swinging", 8.0, REST, moved),
+        hm.Task("push", "Hold a place against an unknown force", 8.0, REST, aside,
+             faults=(hm.Fault(3.0, np.inf, "input_offset", -2.0),)),
     ),
 )  # fmt: skip

@@ -10,20 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import (
-    OCP,
-    DataSpec,
-    Disturbance,
-    Fault,
-    MechanicalPrior,
-    OperatingPoint,
-    Parameter,
-    Scenario,
-    Signal,
-    Task,
-    multisine,
-    random_steps,
-)  # fmt: skip
+import hybrid_mpc as hm
 from scenarios.common import moves
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 
@@ -32,24 +19,24 @@ DT, SECONDS = 0.02, 20.0
 REST = (0.0, 0.0)
 
 
-class LeverPrior(MechanicalPrior):
+class LeverPrior(hm.MechanicalPrior):
     """``J q'' = u - mgl sin q - d q'``; ``y = (l sin q, q')``. The gear between motor and lever has no gap."""
 
-    states: ClassVar[tuple[Signal, ...]] = (
-        Signal("q", "rad", -1.6, 1.6),
-        Signal("q_dot", "rad/s", -15.0, 15.0),
+    states: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("q", "rad", -1.6, 1.6),
+        hm.Signal("q_dot", "rad/s", -15.0, 15.0),
     )
-    inputs: ClassVar[tuple[Signal, ...]] = (Signal("u", "N m", -1.5, 1.5),)
-    outputs: ClassVar[tuple[Signal, ...]] = (
-        Signal("height", "m", -0.8, 0.8), Signal("tacho", "rad/s", -15.0, 15.0),
+    inputs: ClassVar[tuple[hm.Signal, ...]] = (hm.Signal("u", "N m", -1.5, 1.5),)
+    outputs: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("height", "m", -0.8, 0.8), hm.Signal("tacho", "rad/s", -15.0, 15.0),
     )  # fmt: skip
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("J", 0.08, "kg m^2", 0.03, 0.2, "inertia of motor and lever"),
-        Parameter("mgl", 1.5, "N m", 0.7, 3.0, "weight of the lever"),
-        Parameter("d", 0.1, "N m s/rad", 0.0, 0.5, "viscous friction"),
-        Parameter("l", 0.4, "m", 0.2, 0.8, "length to the measured end"),
+    parameters: ClassVar[tuple[hm.Parameter, ...]] = (
+        hm.Parameter("J", 0.08, "kg m^2", 0.03, 0.2, "inertia of motor and lever"),
+        hm.Parameter("mgl", 1.5, "N m", 0.7, 3.0, "weight of the lever"),
+        hm.Parameter("d", 0.1, "N m s/rad", 0.0, 0.5, "viscous friction"),
+        hm.Parameter("l", 0.4, "m", 0.2, 0.8, "length to the measured end"),
     )
-    operating_point: ClassVar[OperatingPoint] = OperatingPoint(REST, (0.0,))
+    operating_point: ClassVar[hm.OperatingPoint] = hm.OperatingPoint(REST, (0.0,))
 
     def mass_matrix(self, q: Any, p: Any) -> Any:
         """Inertia [kg m^2]."""
@@ -114,8 +101,8 @@ class Lever(SimulatedPlant):
 def signals(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Torque: random steps and a multisine of random start."""
     late = rng.uniform(0.0, SECONDS)
-    u = random_steps(t, -0.7, 0.7, hold=(0.4, 2.0), rng=rng)
-    return (u + multisine(t + late, 0.35, 0.2, 2.0, period=SECONDS))[:, None], np.zeros((len(t), 0))
+    u = hm.random_steps(t, -0.7, 0.7, hold=(0.4, 2.0), rng=rng)
+    return (u + hm.multisine(t + late, 0.35, 0.2, 2.0, period=SECONDS))[:, None], np.zeros((len(t), 0))
 
 
 EXPERIMENT = Experiment(
@@ -146,24 +133,24 @@ def lifted(t: Array) -> Array:
     return np.column_stack([moves(t, (0.0, 0.2), 0.5, 0.6)[:, 0], np.zeros(len(t))])
 
 
-scenario = Scenario(
+scenario = hm.Scenario(
     name="lever",
     title="Lever: the sine of its angle and a tachometer, a gear with a gap (simulated)",
     description="A motor lifts a lever. No sensor shows the angle itself: one shows the height of the end, one the "
     "speed. The prior's gear is tight; the machine's has a gap of 0.12 rad.",
     prior=LeverPrior,
-    data=DataSpec("time_s", ("u_nm",), ("height_m", "tacho_rad_s"), dt=DT, max_gap=2 * DT, smoothing=0.14,
+    data=hm.DataSpec("time_s", ("u_nm",), ("height_m", "tacho_rad_s"), dt=DT, max_gap=2 * DT, smoothing=0.14,
                   warm_up=0.5, windows=windows(SECONDS), free_run=3.0),
     make_data=make_data,
     plant=Lever,
     # 1 cm, 3 rad/s, what a height needs is free, 0.5 N m a period
-    control=OCP(40, q=(0.0, 0.1), r=(0.01,), r_delta=(4.0,), u_min=(-1.5,), u_max=(1.5,), q_y=(1e4, 0.0)),
+    control=hm.OCP(40, q=(0.0, 0.1), r=(0.01,), r_delta=(4.0,), u_min=(-1.5,), u_max=(1.5,), q_y=(1e4, 0.0)),
     sensor_sigma=(1e-3, 0.02),
     safe_input=(0.0,),
-    disturbance_model=(Disturbance("input", "u"), Disturbance("output", "tacho", 0.2)),
+    disturbance_model=(hm.Disturbance("input", "u"), hm.Disturbance("output", "tacho", 0.2)),
     tasks=(
-        Task("heights", "Go from height to height", 6.0, REST, heights),
-        Task("hold", "Hold a height against an unknown torque", 6.0, REST, lifted,
-             faults=(Fault(2.0, np.inf, "input_offset", -0.3),)),
+        hm.Task("heights", "Go from height to height", 6.0, REST, heights),
+        hm.Task("hold", "Hold a height against an unknown torque", 6.0, REST, lifted,
+             faults=(hm.Fault(2.0, np.inf, "input_offset", -0.3),)),
     ),
 )  # fmt: skip

@@ -9,20 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import (
-    OCP,
-    Balance,
-    DataSpec,
-    Disturbance,
-    Fault,
-    OperatingPoint,
-    Parameter,
-    Prior,
-    Scenario,
-    Signal,
-    Task,
-    random_steps,
-)  # fmt: skip
+import hybrid_mpc as hm
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 
 Array = NDArray[np.float64]
@@ -43,25 +30,28 @@ REST = _rest()
 """Temperatures [degC] of the operating point."""
 
 
-class TwoHeatersPrior(Prior):
+class TwoHeatersPrior(hm.Prior):
     """``C T_i' = sum_j g_ij Q_j - loss_i (T_i - ambient) - between (T_i - T_j)``; what a heater gives warms both."""
 
-    states: ClassVar[tuple[Signal, ...]] = (
-        Signal("T1", "degC", -20.0, 400.0), Signal("T2", "degC", -20.0, 400.0),
+    states: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("T1", "degC", -20.0, 400.0), hm.Signal("T2", "degC", -20.0, 400.0),
     )  # fmt: skip
-    inputs: ClassVar[tuple[Signal, ...]] = (Signal("Q1", "W", 0.0, 60.0), Signal("Q2", "W", 0.0, 60.0))
-    outputs: ClassVar[tuple[Signal, ...]] = states
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("C", CAPACITY, "J/K", CAPACITY, CAPACITY, "heat capacity (fixed: only ratios show)"),
-        Parameter("g11", GAINS[0][0], "-", 0.5, 2.0, "share of heater 1 that warms place 1"),
-        Parameter("g12", GAINS[0][1], "-", 0.1, 0.9, "share of heater 2 that warms place 1"),
-        Parameter("g21", GAINS[1][0], "-", 0.1, 0.9, "share of heater 1 that warms place 2"),
-        Parameter("g22", GAINS[1][1], "-", 0.4, 1.6, "share of heater 2 that warms place 2"),
-        Parameter("loss1", LOSS[0], "W/K", 0.1, 1.5, "loss of place 1 to the room"),
-        Parameter("loss2", LOSS[1], "W/K", 0.1, 1.5, "loss of place 2 to the room"),
-        Parameter("between", BETWEEN, "W/K", 0.02, 0.6, "conduction between the places"),
+    inputs: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("Q1", "W", 0.0, 60.0),
+        hm.Signal("Q2", "W", 0.0, 60.0),
     )
-    operating_point: ClassVar[OperatingPoint] = OperatingPoint(REST, HEAT)
+    outputs: ClassVar[tuple[hm.Signal, ...]] = states
+    parameters: ClassVar[tuple[hm.Parameter, ...]] = (
+        hm.Parameter("C", CAPACITY, "J/K", CAPACITY, CAPACITY, "heat capacity (fixed: only ratios show)"),
+        hm.Parameter("g11", GAINS[0][0], "-", 0.5, 2.0, "share of heater 1 that warms place 1"),
+        hm.Parameter("g12", GAINS[0][1], "-", 0.1, 0.9, "share of heater 2 that warms place 1"),
+        hm.Parameter("g21", GAINS[1][0], "-", 0.1, 0.9, "share of heater 1 that warms place 2"),
+        hm.Parameter("g22", GAINS[1][1], "-", 0.4, 1.6, "share of heater 2 that warms place 2"),
+        hm.Parameter("loss1", LOSS[0], "W/K", 0.1, 1.5, "loss of place 1 to the room"),
+        hm.Parameter("loss2", LOSS[1], "W/K", 0.1, 1.5, "loss of place 2 to the room"),
+        hm.Parameter("between", BETWEEN, "W/K", 0.02, 0.6, "conduction between the places"),
+    )
+    operating_point: ClassVar[hm.OperatingPoint] = hm.OperatingPoint(REST, HEAT)
 
     def heat(self, u: Any, p: Any) -> tuple[Any, Any]:
         """Heat that reaches each place [W]."""
@@ -75,10 +65,10 @@ class TwoHeatersPrior(Prior):
             (second - p.loss2 * (x.T2 - AMBIENT) + swapped) / p.C,
         )
 
-    def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[Balance, ...]:
+    def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[hm.Balance, ...]:
         """Heat of both places; a room that is warmer heats them, so what they lose to it is a supply."""
         lost = p.loss1 * (x.T1 - AMBIENT) + p.loss2 * (x.T2 - AMBIENT)
-        return (Balance("heat", p.C * (x.T1 + x.T2), sum(self.heat(u, p)) - lost),)
+        return (hm.Balance("heat", p.C * (x.T1 + x.T2), sum(self.heat(u, p)) - lost),)
 
 
 @dataclass(frozen=True)
@@ -118,7 +108,7 @@ class TwoHeaters(SimulatedPlant):
 
 def signals(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Both heaters in random steps."""
-    heat = [random_steps(t, 0.0, 60.0, hold=(60.0, 500.0), rng=rng) for _ in HEAT]
+    heat = [hm.random_steps(t, 0.0, 60.0, hold=(60.0, 500.0), rng=rng) for _ in HEAT]
     return np.column_stack(heat), np.zeros((len(t), 0))
 
 
@@ -145,25 +135,25 @@ def steady(t: Array) -> Array:
     return np.tile(REST, (len(t), 1))
 
 
-scenario = Scenario(
+scenario = hm.Scenario(
     name="two_heaters",
     title="Two heaters that warm each other and radiate (simulated)",
     description="Two heaters, two temperatures, each heater warms both. The prior's losses are in proportion to the "
     "temperature; the machine also radiates, which is more than its prior knows when it is hot.",
     prior=TwoHeatersPrior,
-    data=DataSpec("time_s", ("q1_w", "q2_w"), ("t1_degc", "t2_degc"), dt=DT, max_gap=2 * DT, smoothing=80.0,
+    data=hm.DataSpec("time_s", ("q1_w", "q2_w"), ("t1_degc", "t2_degc"), dt=DT, max_gap=2 * DT, smoothing=80.0,
                   warm_up=150.0, windows=windows(SECONDS), free_run=1500.0),
     make_data=make_data,
     plant=TwoHeaters,
     # 1 K, the heat that a set-point needs is free, 15 W a period; 300 s are three time constants
-    control=OCP(30, q=(0.0, 0.0), r=(1e-4, 1e-4), r_delta=(4e-3, 4e-3), u_min=(0.0, 0.0), u_max=(60.0, 60.0),
+    control=hm.OCP(30, q=(0.0, 0.0), r=(1e-4, 1e-4), r_delta=(4e-3, 4e-3), u_min=(0.0, 0.0), u_max=(60.0, 60.0),
                 q_y=(1.0, 1.0)),
     sensor_sigma=(0.2, 0.2),
     safe_input=(0.0, 0.0),
-    disturbance_model=(Disturbance("input", "Q1"), Disturbance("input", "Q2")),
+    disturbance_model=(hm.Disturbance("input", "Q1"), hm.Disturbance("input", "Q2")),
     tasks=(
-        Task("warm", "Warm both places up, then cool one", 2000.0, REST, warm),
-        Task("draught", "Keep both temperatures although heater 1 gives less", 1500.0, REST, steady,
-             faults=(Fault(200.0, np.inf, "input_offset", -3.0, "Q1"),)),
+        hm.Task("warm", "Warm both places up, then cool one", 2000.0, REST, warm),
+        hm.Task("draught", "Keep both temperatures although heater 1 gives less", 1500.0, REST, steady,
+             faults=(hm.Fault(200.0, np.inf, "input_offset", -3.0, "Q1"),)),
     ),
 )  # fmt: skip

@@ -10,20 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import (
-    OCP,
-    DataSpec,
-    Disturbance,
-    Fault,
-    MechanicalPrior,
-    OperatingPoint,
-    Parameter,
-    Scenario,
-    Signal,
-    Task,
-    multisine,
-    random_steps,
-)  # fmt: skip
+import hybrid_mpc as hm
 from scenarios.common import moves
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 
@@ -33,27 +20,27 @@ LIMITS = (8.0, 3.0)
 REST = (0.0, 0.0, 0.0, 0.0)
 
 
-class TwoLinkArmPrior(MechanicalPrior):
+class TwoLinkArmPrior(hm.MechanicalPrior):
     """Two links without dry friction; angle 0 hangs down, the elbow's is that of the forearm against the upper arm."""
 
-    states: ClassVar[tuple[Signal, ...]] = (
-        Signal("shoulder", "rad", -3.0, 3.0), Signal("elbow", "rad", -3.0, 3.0),
-        Signal("shoulder_rate", "rad/s", -20.0, 20.0), Signal("elbow_rate", "rad/s", -30.0, 30.0),
+    states: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("shoulder", "rad", -3.0, 3.0), hm.Signal("elbow", "rad", -3.0, 3.0),
+        hm.Signal("shoulder_rate", "rad/s", -20.0, 20.0), hm.Signal("elbow_rate", "rad/s", -30.0, 30.0),
     )  # fmt: skip
-    inputs: ClassVar[tuple[Signal, ...]] = (
-        Signal("tau_1", "N m", -LIMITS[0], LIMITS[0]), Signal("tau_2", "N m", -LIMITS[1], LIMITS[1]),
+    inputs: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("tau_1", "N m", -LIMITS[0], LIMITS[0]), hm.Signal("tau_2", "N m", -LIMITS[1], LIMITS[1]),
     )  # fmt: skip
-    outputs: ClassVar[tuple[Signal, ...]] = states[:2]
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("a", 0.35, "kg m^2", 0.15, 0.7, "both links about the shoulder, elbow at a right angle"),
-        Parameter("b", 0.09, "kg m^2", 0.02, 0.12, "coupling"),
-        Parameter("c", 0.09, "kg m^2", 0.05, 0.2, "forearm about the elbow"),
-        Parameter("g_1", 5.0, "N m", 2.0, 10.0, "weight at the shoulder"),
-        Parameter("g_2", 1.8, "N m", 0.8, 4.0, "weight at the elbow"),
-        Parameter("d_1", 0.4, "N m s/rad", 0.0, 2.0, "viscous friction of the shoulder"),
-        Parameter("d_2", 0.1, "N m s/rad", 0.0, 1.0, "viscous friction of the elbow"),
+    outputs: ClassVar[tuple[hm.Signal, ...]] = states[:2]
+    parameters: ClassVar[tuple[hm.Parameter, ...]] = (
+        hm.Parameter("a", 0.35, "kg m^2", 0.15, 0.7, "both links about the shoulder, elbow at a right angle"),
+        hm.Parameter("b", 0.09, "kg m^2", 0.02, 0.12, "coupling"),
+        hm.Parameter("c", 0.09, "kg m^2", 0.05, 0.2, "forearm about the elbow"),
+        hm.Parameter("g_1", 5.0, "N m", 2.0, 10.0, "weight at the shoulder"),
+        hm.Parameter("g_2", 1.8, "N m", 0.8, 4.0, "weight at the elbow"),
+        hm.Parameter("d_1", 0.4, "N m s/rad", 0.0, 2.0, "viscous friction of the shoulder"),
+        hm.Parameter("d_2", 0.1, "N m s/rad", 0.0, 1.0, "viscous friction of the elbow"),
     )
-    operating_point: ClassVar[OperatingPoint] = OperatingPoint(REST, (0.0, 0.0))
+    operating_point: ClassVar[hm.OperatingPoint] = hm.OperatingPoint(REST, (0.0, 0.0))
 
     def mass_matrix(self, q: Any, p: Any) -> Any:
         """Inertia [kg m^2]."""
@@ -112,8 +99,8 @@ def signals(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Torques: random steps and a multisine of random start."""
     late = rng.uniform(0.0, SECONDS)
     tau = [
-        random_steps(t, -0.3 * most, 0.3 * most, hold=(0.3, 1.5), rng=rng)
-        + multisine(t + late, 0.12 * most, 0.2, 2.5, period=SECONDS)
+        hm.random_steps(t, -0.3 * most, 0.3 * most, hold=(0.3, 1.5), rng=rng)
+        + hm.multisine(t + late, 0.12 * most, 0.2, 2.5, period=SECONDS)
         for most in LIMITS
     ]
     return np.column_stack(tau), np.zeros((len(t), 0))
@@ -142,25 +129,25 @@ def lifted(t: Array) -> Array:
     return np.column_stack([moves(t, (0.0, level), 0.5, 0.7)[:, 0] for level in (0.5, 0.4)])
 
 
-scenario = Scenario(
+scenario = hm.Scenario(
     name="two_link_arm",
     title="Two-link arm with two torques: joints that stick (simulated)",
     description="An arm of two links hangs from its shoulder. The prior knows inertia, weight and viscous friction; "
     "the machine's joints also stick.",
     prior=TwoLinkArmPrior,
-    data=DataSpec("time_s", ("tau1_nm", "tau2_nm"), ("shoulder_rad", "elbow_rad"), dt=DT, max_gap=2 * DT,
+    data=hm.DataSpec("time_s", ("tau1_nm", "tau2_nm"), ("shoulder_rad", "elbow_rad"), dt=DT, max_gap=2 * DT,
                   smoothing=0.14, warm_up=0.5, windows=windows(SECONDS), free_run=3.0),
     make_data=make_data,
     plant=TwoLinkArm,
     # 20 mrad, 2 rad/s, what a place needs is free, a fifth of the torque a period
-    control=OCP(40, q=(0.0, 0.0, 0.25, 0.25), r=(1e-3, 1e-2), r_delta=(0.4, 3.0), u_min=tuple(-v for v in LIMITS),
+    control=hm.OCP(40, q=(0.0, 0.0, 0.25, 0.25), r=(1e-3, 1e-2), r_delta=(0.4, 3.0), u_min=tuple(-v for v in LIMITS),
                 u_max=LIMITS, q_y=(2500.0, 2500.0)),
     sensor_sigma=(1e-3, 1e-3),
     safe_input=(0.0, 0.0),
-    disturbance_model=(Disturbance("input", "tau_1"), Disturbance("input", "tau_2")),
+    disturbance_model=(hm.Disturbance("input", "tau_1"), hm.Disturbance("input", "tau_2")),
     tasks=(
-        Task("reach", "Go from place to place", 6.0, REST, reach),
-        Task("carry", "Hold a place against an unknown torque", 6.0, REST, lifted,
-             faults=(Fault(2.0, np.inf, "input_offset", -1.0, "tau_1"),)),
+        hm.Task("reach", "Go from place to place", 6.0, REST, reach),
+        hm.Task("carry", "Hold a place against an unknown torque", 6.0, REST, lifted,
+             faults=(hm.Fault(2.0, np.inf, "input_offset", -1.0, "tau_1"),)),
     ),
 )  # fmt: skip

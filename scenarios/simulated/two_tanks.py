@@ -10,20 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc import (
-    OCP,
-    Balance,
-    DataSpec,
-    Disturbance,
-    Fault,
-    OperatingPoint,
-    Parameter,
-    Prior,
-    Scenario,
-    Signal,
-    Task,
-    random_steps,
-)  # fmt: skip
+import hybrid_mpc as hm
 from scenarios.simulated.plant import Experiment, SimulatedPlant, windows
 
 Array = NDArray[np.float64]
@@ -40,29 +27,32 @@ def outflow(pipe: Any, level: Any) -> Any:
     return pipe * ca.sqrt(2 * GRAVITY * ca.fmax(level, 1e-4))
 
 
-class TwoTanksPrior(Prior):
+class TwoTanksPrior(hm.Prior):
     """``area upper' = pump - outflow(upper)``, ``area lower' = outflow(upper) + inflow - outflow(lower)``."""
 
-    states: ClassVar[tuple[Signal, ...]] = (Signal("upper", "m", 0.0, 2.0), Signal("lower", "m", 0.0, 2.0))
-    inputs: ClassVar[tuple[Signal, ...]] = (Signal("pump", "m^3/s", 0.0, 4e-4),)
-    disturbances: ClassVar[tuple[Signal, ...]] = (Signal("inflow", "m^3/s", 0.0, 2e-4),)
-    outputs: ClassVar[tuple[Signal, ...]] = (Signal("lower", "m", -0.1, 2.0),)
-    parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("area", AREA, "m^2", AREA, AREA, "floor of a tank (fixed: by a ruler)"),
-        Parameter("pipe_upper", PIPE, "m^2", 6e-5, 2.4e-4, "clear width of the upper tank's pipe"),
-        Parameter("pipe_lower", PIPE, "m^2", 6e-5, 2.4e-4, "of the lower tank's"),
+    states: ClassVar[tuple[hm.Signal, ...]] = (
+        hm.Signal("upper", "m", 0.0, 2.0),
+        hm.Signal("lower", "m", 0.0, 2.0),
     )
-    operating_point: ClassVar[OperatingPoint] = OperatingPoint(LEVELS, (PUMP,), (INFLOW,))
+    inputs: ClassVar[tuple[hm.Signal, ...]] = (hm.Signal("pump", "m^3/s", 0.0, 4e-4),)
+    disturbances: ClassVar[tuple[hm.Signal, ...]] = (hm.Signal("inflow", "m^3/s", 0.0, 2e-4),)
+    outputs: ClassVar[tuple[hm.Signal, ...]] = (hm.Signal("lower", "m", -0.1, 2.0),)
+    parameters: ClassVar[tuple[hm.Parameter, ...]] = (
+        hm.Parameter("area", AREA, "m^2", AREA, AREA, "floor of a tank (fixed: by a ruler)"),
+        hm.Parameter("pipe_upper", PIPE, "m^2", 6e-5, 2.4e-4, "clear width of the upper tank's pipe"),
+        hm.Parameter("pipe_lower", PIPE, "m^2", 6e-5, 2.4e-4, "of the lower tank's"),
+    )
+    operating_point: ClassVar[hm.OperatingPoint] = hm.OperatingPoint(LEVELS, (PUMP,), (INFLOW,))
 
     def xdot(self, x: Any, u: Any, w: Any, p: Any) -> Any:
         """Rates of both levels [m/s]."""
         between, out = outflow(p.pipe_upper, x.upper), outflow(p.pipe_lower, x.lower)
         return (u.pump - between) / p.area, (between + w.inflow - out) / p.area
 
-    def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[Balance, ...]:
+    def balances(self, x: Any, u: Any, w: Any, p: Any) -> tuple[hm.Balance, ...]:
         """Volume of water in both tanks."""
         volume, lost = p.area * (x.upper + x.lower), outflow(p.pipe_lower, x.lower)
-        return (Balance("volume", volume, u.pump + w.inflow, lost, "m^3", "m^3/s"),)
+        return (hm.Balance("volume", volume, u.pump + w.inflow, lost, "m^3", "m^3/s"),)
 
 
 @dataclass(frozen=True)
@@ -90,8 +80,8 @@ class TwoTanks(SimulatedPlant):
 
 def signals(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Pump and inflow in random steps."""
-    pump = random_steps(t, 4e-5, 3.6e-4, hold=(40.0, 250.0), rng=rng)
-    return pump[:, None], random_steps(t, 0.0, 8e-5, hold=(100.0, 500.0), rng=rng)[:, None]
+    pump = hm.random_steps(t, 4e-5, 3.6e-4, hold=(40.0, 250.0), rng=rng)
+    return pump[:, None], hm.random_steps(t, 0.0, 8e-5, hold=(100.0, 500.0), rng=rng)[:, None]
 
 
 EXPERIMENT = Experiment(
@@ -126,26 +116,26 @@ def rain(t: Array) -> Array:
     return np.interp(t, [200.0, 205.0, 500.0, 505.0], [INFLOW, 2 * INFLOW, 2 * INFLOW, 0.0])[:, None]
 
 
-scenario = Scenario(
+scenario = hm.Scenario(
     name="two_tanks",
     title="Two tanks: the upper level is not measured, and runs over (simulated)",
     description="A pump fills the upper of two tanks, which drains into the lower one; a measured inflow joins there. "
     "The prior knows pipes and floors; above 0.36 m the upper tank runs over, which it does not know.",
     prior=TwoTanksPrior,
-    data=DataSpec("time_s", ("pump",), ("lower_m",), dt=DT, max_gap=2 * DT, smoothing=40.0, warm_up=150.0,
+    data=hm.DataSpec("time_s", ("pump",), ("lower_m",), dt=DT, max_gap=2 * DT, smoothing=40.0, warm_up=150.0,
                   disturbances=("inflow",), windows=windows(SECONDS), free_run=800.0),
     make_data=make_data,
     plant=TwoTanks,
     # 1 cm, half the pump, a tenth of it a period; 200 s are five time constants of a tank
-    control=OCP(40, q=(0.0, 0.0), r=(2.5e5,), r_delta=(6e8,), u_min=(0.0,), u_max=(4e-4,), q_y=(1e4,)),
+    control=hm.OCP(40, q=(0.0, 0.0), r=(2.5e5,), r_delta=(6e8,), u_min=(0.0,), u_max=(4e-4,), q_y=(1e4,)),
     sensor_sigma=(1e-3,),
     first_sigma=(0.05,),
     safe_input=(0.0,),
-    disturbance_model=(Disturbance("input", "pump"),),
+    disturbance_model=(hm.Disturbance("input", "pump"),),
     tasks=(
-        Task("levels", "Change the lower level", 900.0, LEVELS, levels),
-        Task("leak", "Hold the level although the pump gives less", 900.0, LEVELS, still,
-             faults=(Fault(100.0, np.inf, "input_offset", -3e-5),)),
-        Task("rain", "Hold the level while the inflow changes", 900.0, LEVELS, still, w=rain),
+        hm.Task("levels", "Change the lower level", 900.0, LEVELS, levels),
+        hm.Task("leak", "Hold the level although the pump gives less", 900.0, LEVELS, still,
+             faults=(hm.Fault(100.0, np.inf, "input_offset", -3e-5),)),
+        hm.Task("rain", "Hold the level while the inflow changes", 900.0, LEVELS, still, w=rain),
     ),
 )  # fmt: skip

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from hybrid_mpc import Parameter, Signal
 
-STATES = (
-    Signal("phi", "rad", -60.0, 60.0, periodic=True),
-    Signal("phi_dot", "rad/s", -100.0, 100.0),
-)
+STATES = (Signal("phi", "rad", -60.0, 60.0, periodic=True), Signal("phi_dot", "rad/s", -100.0, 100.0))
 INPUTS = (Signal("voltage", "V", -12.0, 12.0),)
 OUTPUTS = (STATES[0],)
 DT = 0.025

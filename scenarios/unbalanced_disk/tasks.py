@@ -18,14 +18,7 @@ PEAK = 3.0
 # Bryson's rule: one over the square of the largest deviation that is tolerable: 50 mrad, 1 rad/s, 2 V of change per
 # period. Voltage that a reference needs is no deviation; its weight (10 V) only keeps the problem regular. A second
 # ahead is twelve of the upright disk's time constants (1 / w_0 = 86 ms).
-CONTROL = OCP(
-    horizon=40,
-    q=(400.0, 1.0),
-    r=(0.01,),
-    r_delta=(0.25,),
-    u_min=(-PEAK,),
-    u_max=(PEAK,),
-)
+CONTROL = OCP(horizon=40, q=(400.0, 1.0), r=(0.01,), r_delta=(0.25,), u_min=(-PEAK,), u_max=(PEAK,))
 # At the top, at the tolerated speed: at rest the slope of dry friction would pass for strong damping.
 UPRIGHT = CONTROL.changed(working_point=((pi, 1.0), (0.0,)))
 

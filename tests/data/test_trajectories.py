@@ -106,10 +106,7 @@ def test_units_of_columns(tmp_path):
     np.testing.assert_allclose(got.t, plain.t, atol=1e-12)
     np.testing.assert_allclose(got.y, plain.y, atol=1e-9)  # ten digits of CSV
     np.testing.assert_allclose(got.u, 0.5 * plain.u, atol=1e-12)
-    for units, match in (
-        ({"phi": "Nm"}, "HM-DATA-073"),
-        ({"tau": 0.0}, "HM-DATA-073"),
-    ):
+    for units, match in (({"phi": "Nm"}, "HM-DATA-073"), ({"tau": 0.0}, "HM-DATA-073")):
         with pytest.raises(InputError, match=match):
             load_trajectories([tmp_path / "run.csv"], SIGNALS, replace(SPEC, units=units))
 

@@ -22,7 +22,7 @@ from hybrid_mpc import OCP, ChannelLimit, CondensedController, InputError, Watch
 from hybrid_mpc.embedded import export
 from hybrid_mpc.embedded.export import OTHERS, TOLERANCE
 from hybrid_mpc.embedded.generate import GENERATED, HEADERS, SOURCES, _config, make_sources
-from hybrid_mpc.embedded.scalar import c_function, comment
+from hybrid_mpc.embedded.scalar import c_function, comment, scalar_code
 from hybrid_mpc.embedded.watch import Watched
 from hybrid_mpc.errors import StorageError
 from hybrid_mpc.files import write_document
@@ -222,6 +222,10 @@ def test_what_has_no_c_is_refused_by_name_all_at_once():
 
 
 def test_an_operation_without_c_is_named():
+    m = ca.MX.sym("m", 2, 2)
+    solved = ca.solve(m, ca.DM([1.0, 2.0]), "lapacklu")
+    with pytest.raises(InputError, match=r"its step: .*HM-EMBEDDED-006"):
+        scalar_code("its step", ca.Function("step", [m], [solved]))
     x = ca.SX.sym("x")
     with pytest.raises(InputError, match=r"OP_ERFINV.*HM-EMBEDDED-009"):
         c_function("f", ["const real *x", "real *y"], {"x": x}, [("y[0]", ca.erfinv(x))])

@@ -4,13 +4,7 @@ import numpy as np
 from embedded_parts import CLoop
 from wrapped_machine import SIGMAS, boat, problem, samples, wrapped
 
-from hybrid_mpc import (
-    CondensedController,
-    ExtendedKalmanFilter,
-    Loop,
-    SafeController,
-    SwitchingFilter,
-)
+from hybrid_mpc import CondensedController, ExtendedKalmanFilter, Loop, SafeController, SwitchingFilter
 from hybrid_mpc.embedded.native import NativeController
 
 

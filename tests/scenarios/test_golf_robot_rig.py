@@ -10,14 +10,7 @@ import pytest
 
 from hybrid_mpc import InputError
 from scenarios.common import rk4
-from scenarios.golf_robot.dynamics import (
-    LOSSES,
-    N_STATES,
-    RigParameters,
-    powers,
-    rhs,
-    stored_energy,
-)
+from scenarios.golf_robot.dynamics import LOSSES, N_STATES, RigParameters, powers, rhs, stored_energy
 from scenarios.golf_robot.nominal import GEAR
 from scenarios.golf_robot.rig import Rig
 

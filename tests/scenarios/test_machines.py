@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 from energy_checks import check_balances, random_points, random_values, rates, scenario_priors
 
-from hybrid_mpc import (
-    InputError,
-    Trajectory,
-    load_trajectories,
-    write_csv,
-)
+from hybrid_mpc import InputError, Trajectory, load_trajectories, write_csv
 from hybrid_mpc.identify.simulation import required_substeps
 from hybrid_mpc.scenario import load_scenario, registered_scenarios
 from hybrid_mpc.workflow.benchmark_runs import in_turn, read_test, read_training

@@ -7,11 +7,7 @@ import pytest
 from monitor_parts import energy
 
 from hybrid_mpc import InputError
-from scenarios.golf_robot.monitor_study.detection import (
-    METHODS,
-    Trace,
-    learn_detectors,
-)
+from scenarios.golf_robot.monitor_study.detection import METHODS, Trace, learn_detectors
 
 STEP, RATE = 1.5e-3, 2.5
 PERIODS = 9_000  # 180 s: 35 blocks of 5 s after the first second

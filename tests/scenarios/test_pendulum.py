@@ -9,15 +9,7 @@ from scipy.integrate import solve_ivp
 from hybrid_mpc import InputError, load_trajectories
 from hybrid_mpc.workflow.stages.results import read_results
 from scenarios.pendulum import scenario
-from scenarios.pendulum.data import (
-    AMPLITUDE,
-    DURATION,
-    exact_runs,
-    make_data,
-    recordings,
-    run,
-    stems,
-)
+from scenarios.pendulum.data import AMPLITUDE, DURATION, exact_runs, make_data, recordings, run, stems
 from scenarios.pendulum.oracle import oracle
 from scenarios.pendulum.plant import DampedPendulum, PendulumParameters
 from scenarios.pendulum.prior import PendulumPrior

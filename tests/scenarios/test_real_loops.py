@@ -176,8 +176,7 @@ HELD = [
 
 
 @pytest.mark.parametrize(
-    ("name", "task", "periods"),
-    [HELD[0], *(pytest.param(*one, marks=pytest.mark.full) for one in HELD[1:])],
+    ("name", "task", "periods"), [HELD[0], *(pytest.param(*one, marks=pytest.mark.full) for one in HELD[1:])]
 )
 def test_the_priors_controller_holds_a_set_point_under_a_load(name, task, periods):
     """The mean error of the last fifth is below what steps of the sensor allow, and no input leaves its limits."""

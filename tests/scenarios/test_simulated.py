@@ -62,15 +62,7 @@ def made(tmp_path_factory):
         prior = scenario.prior(fit.values)
         train = smoothed(scenario.prior, fit, train, dt)
         settings = hm.TrainingSettings(
-            "mopgrnn",
-            4,
-            2,
-            teacher_steps=0,
-            free_run_steps=60,
-            seed=0,
-            warm=5,
-            horizon=60,
-            every=10,
+            "mopgrnn", 4, 2, teacher_steps=0, free_run_steps=60, seed=0, warm=5, horizon=60, every=10
         )
         trained = hm.train(prior, train, train, settings)  # so short a recording has none to spare
         step, info = trained.step(prior, dt), hm.model_info(prior, dt)

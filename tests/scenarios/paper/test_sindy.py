@@ -7,14 +7,7 @@ import pytest
 import torch
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc import (
-    InputError,
-    PriorStep,
-    check_parity,
-    free_runs,
-    model_info,
-    trace_model,
-)
+from hybrid_mpc import InputError, PriorStep, check_parity, free_runs, model_info, trace_model
 from scenarios.paper.jobs import figures_of
 from scenarios.paper.sindy import Factor, Library, SindyStep, fit_sindy, machine_libraries
 from scenarios.pendulum.data import exact_runs
