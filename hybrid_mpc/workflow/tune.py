@@ -140,7 +140,9 @@ def _write(context: Context, settings: TuneSettings, found: SearchResult) -> Non
     ]
     columns = ("number", "state", "value", "mean", "steps", "duration_s", *names)
     write_text(out / "trials.csv", Table(columns, rows).csv())
-    save(plots.history(found.trials, base=found.base), out / "figures" / "tune_history.png")
-    save(plots.settings(found.trials, names), out / "figures" / "tune_settings.png")
+    drawn = [t.state for t in found.trials], [t.value for t in found.trials]
+    searched = {name: [t.values[name] for t in found.trials] for name in names}
+    save(plots.history(*drawn, base=found.base), out / "figures" / "tune_history.png")
+    save(plots.settings(searched, *drawn), out / "figures" / "tune_settings.png")
     write_json(out / "settings.json", best)
     write_json(out / "results.json", results)
