@@ -17,9 +17,11 @@ from hybrid_mpc.compare.sequential import SAME, hardest
 from hybrid_mpc.compare.step_response import step_responses
 from hybrid_mpc.compare.summary import Summary
 from hybrid_mpc.compare.tasks import tasks_of
+from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
+from hybrid_mpc.records import plain
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
 from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.watch.detector import WatchLimits
@@ -43,7 +45,7 @@ from hybrid_mpc.workflow.stages.identify import (
     training_settings,
 )
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
-from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect, write_results
+from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect
 from hybrid_mpc.workflow.stages.track import TrackResult
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchedRecording, WatchResult
 
@@ -83,7 +85,7 @@ def report_stage(context: Context) -> ReportResult:
     results = collect(context)
     figures = draw_all(context)
     write_report(context.out / "report.html", _report(context, results, figures))
-    write_results(context.out / "results.json", results)
+    write_json(context.out / "results.json", plain(results))
     drawn = tuple(path.name for group in figures.values() for path, _ in group)
     return ReportResult("report.html", drawn)
 
