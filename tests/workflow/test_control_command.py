@@ -235,12 +235,6 @@ def test_the_folder_must_be_empty(call, run_folder, tmp_path):
     assert (tmp_path / "mine.txt").read_text() == "keep"
 
 
-def test_help_has_an_example(call):
-    code, told, _ = call("--help")
-    assert code == 0
-    assert "hybrid-mpc control golf_robot --model runs/golf/model" in " ".join(told.split())
-
-
 def test_names_and_beginnings_of_tasks():
     names = lambda *given: [t.name for t in selected_tasks(GOLF, given)]  # noqa: E731
     assert len(names()) == len(GOLF.tasks)
