@@ -206,7 +206,6 @@ def run_model(model: HybridModel, x0: ArrayLike) -> Run:
 
 
 def _check_power(signal: Array, what: str) -> None:
-    """Refuse a signal ``(n,)`` whose power is not finite."""
     wrong = np.flatnonzero(~(np.abs(signal) <= LARGEST))
     if wrong.size:
         raise InputError(

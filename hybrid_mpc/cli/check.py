@@ -163,7 +163,6 @@ def _error(value: float | None) -> str:
 
 
 def _free_runs(prior: Prior, found: PriorResult) -> Table:
-    """Errors of the prior and of simpler models in free runs."""
     length = "" if found.longest_run is None else f" of {found.longest_run:.3g} s"
     columns = [text for s in prior.outputs for text in (f"RMSE {s.label}", f"FIT {s.name} [%]")]
     table = make_table(f"free runs{length} on the test recordings", "model", "error [spreads]", *columns)
@@ -237,7 +236,6 @@ def make_table(title: str, *columns: str) -> Table:
 
 
 def _signals(found: Preflight, prior: Prior, spec: DataSpec) -> Table:
-    """Signals with units, ranges and columns, and their recorded ranges."""
     recorded = found.dataset is not None
     table = make_table("signals", "", "name", "unit", "range", "column", *(["recorded"] if recorded else []))
     for role, signals, columns, key in (

@@ -89,7 +89,6 @@ def summary(found: ExplainResult, folder: Path) -> list[str]:
 
 
 def _steps(found: ExplainResult) -> Table:
-    """One row per step."""
     from hybrid_mpc.workflow.explain_page import RATIO, alternatives_of, signed, values_of
 
     explanation = found.explanation
@@ -104,7 +103,6 @@ def _steps(found: ExplainResult) -> Table:
 
 
 def _tests(found: ExplainResult) -> Table:
-    """One row per model."""
     from hybrid_mpc.workflow.explain_page import MODELS
 
     labels = list(next(iter(found.tests.values())).rmse)

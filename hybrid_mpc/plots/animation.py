@@ -118,7 +118,6 @@ class Scene:
     def _body(
         self, ax: Axes, index: int, ink: str, alpha: float, width: float
     ) -> tuple[int, Line2D | Polygon]:
-        """Index and artist of one of the machine's moving lines."""
         if not _closed(self._loop.draw(self._loop.x[0])[index]):
             return index, self._line(ax, color=ink, linewidth=width, alpha=alpha, solid_capstyle="round")
         shape = Polygon([(0.0, 0.0)], color=ink, linewidth=0.0, alpha=alpha, zorder=2, animated=True)

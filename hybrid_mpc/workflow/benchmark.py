@@ -431,7 +431,6 @@ def recommended(
 
 
 def _note(settings: BenchmarkSettings, scenario: Scenario, data: Recordings) -> JobNote:
-    """The note of a benchmark in its folder: another benchmark there is refused."""
     pieces = digest([[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)])
     own = _Note(scenario.name, data.dataset.hash, scenario.data.dt, settings.budget, settings.seed, pieces)
     return JobNote(NOUN, plain(own))
@@ -468,7 +467,6 @@ def _evaluated(
     warnings: Sequence[str],
     refit: float | None,
 ) -> BenchmarkResults:
-    """The results of the stages, and free runs over the test files."""
     progress, scenario, settings = context.progress, context.scenario, context.settings
     progress.start("free runs over the test files")
     choice = context.read(CHOICE_OF_BENCHMARK)

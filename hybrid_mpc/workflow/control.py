@@ -117,7 +117,6 @@ def run_control(
 
 
 def _rows(bench: Bench, study: Study, model: StudyModel, folder: Path, progress: Progress) -> list[LoopRow]:
-    """Rows of all loops: read those that the folder holds, run the others."""
     first, specs = study.loop_seeds[0], dict[str, list[LoopSpec]]()
     for spec in study.runs():
         arrays = ("step_ms", *((*DRAWN, "plans", "alarm") if spec.seed == first else ()))

@@ -112,7 +112,6 @@ def usage(settings: RunSettings, out: Path) -> str:
 
 
 def _write(context: Context, settings: TuneSettings, found: SearchResult) -> None:
-    """Settings, table, figures, and results.json last."""
     out, names = context.out, settings.space.names
     fields = dict.fromkeys("learning_rates" if name in RATES else name for name in names)
     best = {name: getattr(found.settings, name) for name in fields}

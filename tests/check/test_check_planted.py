@@ -327,10 +327,7 @@ scenario = Scenario("valve", "", "", prior=Valve, data=DataSpec("t", ("v",), ("y
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (
-            "integer=True",
-            ["valve.py:6", "'integer'", "Inputs that are integers"],
-        ),
+        ("integer=True", ["valve.py:6", "'integer'", "Inputs that are integers"]),
         ("values=(0, 1)", ["valve.py:6", "'values'", "Inputs that are integers"]),
         ("lover=0.0", ["valve.py:6", "'lover'", "did you mean 'lower'?"]),
     ],

@@ -460,10 +460,7 @@ def test_set_points_of_outputs_measured_disturbances_and_a_disturbance_model_pas
     ("changed", "words"),
     [
         (lambda t: filled(2.5)(t), ["reference: lower [m] is 2.5 at 20 s, outside its range 0 to 2"]),
-        (
-            lambda t: np.zeros((len(t), 2)),
-            ["reference: must return shape (60, 1) for 60 times, got (60, 2)"],
-        ),
+        (lambda t: np.zeros((len(t), 2)), ["reference: must return shape (60, 1) for 60 times, got (60, 2)"]),
     ],
     ids=["beyond the range", "of the states"],
 )

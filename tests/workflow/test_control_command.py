@@ -191,17 +191,6 @@ def test_bad_models(call, run_folder, tmp_path):
     (tmp_path / "letters" / "a.txt").write_text("dear")
     code, _, error = call("golf_robot", "--model", tmp_path / "letters", "--out", tmp_path / "o")
     assert (code, "HM-KIT-038" in error) == (2, True)
-    for name, damage in (
-        ("models/weights.safetensors", lambda b: b[: len(b) // 2]),
-        ("models/programs.json", lambda b: b[:-100]),
-        ("kit.json", lambda b: b.replace(b"schema_version", b"version")),
-    ):
-        folder = tmp_path / name
-        shutil.copytree(run_folder / "model", folder)
-        (folder / name).write_bytes(damage((folder / name).read_bytes()))
-        code, _, error = call("golf_robot", "--model", folder, "--out", tmp_path / "o")
-        assert code == 2, name
-        assert str(folder) in error
     assert not (tmp_path / "o").exists()
 
 

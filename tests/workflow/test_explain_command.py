@@ -57,12 +57,7 @@ def test_the_missing_friction_is_found(explained):
 def test_its_page_shows_the_steps_and_the_term(explained):
     out, found = explained
     page = (out / "explain.html").read_text()
-    for words in (
-        "Coulomb friction of phi_dot",
-        "-F_c_phi_dot sign(phi_dot)",
-        found.file,
-        "sensor noise",
-    ):
+    for words in ("Coulomb friction of phi_dot", "-F_c_phi_dot sign(phi_dot)", found.file, "sensor noise"):
         assert words in page
     assert {p.name for p in (out / "figures").iterdir()} == {"error_by_step.png", "step_1_1.png"}
     assert page.count("data:image/png") == 2

@@ -90,7 +90,6 @@ def _saved(figure: Figure, path: Path) -> Path:
 
 
 def _explain(context: Context) -> Any:
-    """Error after each found term, and the terms over their data."""
     found = context.find(EXPLAIN)
     if isinstance(found, Absent):
         return
@@ -208,7 +207,6 @@ def metrics_of(prior: Prior) -> dict[str, str]:
 
 
 def _flat(scores: Scores) -> dict[str, Any]:
-    """Errors by name; None if a run diverged."""
     every = {"error": scores.error, "e_sim": scores.e_sim}
     every |= {f"rmse {label}": value for label, value in scores.rmse.items()}
     every |= {f"violation {label}": value for label, value in scores.violation.items()}
@@ -216,7 +214,6 @@ def _flat(scores: Scores) -> dict[str, Any]:
 
 
 def _band(prior: Prior, arrays: Any, run: str) -> dict[str, tuple[Any, Any]]:
-    """The hybrid's band by the name of an output: lower and upper end."""
     y_hat, half = arrays[f"{run}/y_hat"], arrays[f"{run}/band"]
     return {s.name: (y_hat[:, j] - half[:, j], y_hat[:, j] + half[:, j]) for j, s in enumerate(prior.outputs)}
 

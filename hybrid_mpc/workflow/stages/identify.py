@@ -407,7 +407,6 @@ def examined_prior(context: Context) -> PriorResult:
 
 
 def _error_of(baseline: BaselineScores) -> float:
-    """Error of a baseline; infinite if the baseline has no errors."""
     return math.inf if baseline.errors is None else baseline.errors.error
 
 

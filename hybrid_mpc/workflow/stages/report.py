@@ -38,12 +38,7 @@ from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult, fi
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import ExportResult
 from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
-from hybrid_mpc.workflow.stages.identify import (
-    DATA,
-    DataResult,
-    models_of,
-    training_settings,
-)
+from hybrid_mpc.workflow.stages.identify import DATA, DataResult, models_of, training_settings
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect
 from hybrid_mpc.workflow.stages.track import TrackResult
@@ -337,7 +332,6 @@ def _data_table(data: DataResult) -> Table:
 
 
 def _explained(context: Context) -> bool:
-    """Whether missing terms were searched."""
     found = context.find(EXPLAIN)
     return not isinstance(found, Absent)
 
@@ -442,7 +436,6 @@ def _band_table(context: Context, found: EvaluationResult) -> Table:
 
 
 def _by(values: Mapping[str, float], label: str) -> float | None:
-    """The finite number of a signal, or None."""
     return finite(values.get(label, math.nan))
 
 
@@ -587,7 +580,6 @@ def _observer_table(found: EstimationResult) -> Table:
 
 
 def _varying_table(found: TrackResult) -> Table:
-    """Parameters by their variation between recordings."""
     tracked = {one.name: one for one in found.tracking.tracked}
     rows = [
         (f"{p.name} [{p.unit}]", p.value, p.std or "fixed", p.gain,
@@ -617,7 +609,6 @@ def _timing_table(ms: StepTimes) -> Table:
 
 
 def _watch_tables(found: WatchResult) -> list[Table]:
-    """Tables of the channels, of the loops with a fault, and of the alarms on recordings."""
     if found.limits is None:
         return []
     tables = [watching_table(found, found.limits)]

@@ -20,14 +20,7 @@ from hybrid_mpc.workflow.stages.estimate import ESTIMATION, EstimationResult
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, ExportResult, NoiseResult
-from hybrid_mpc.workflow.stages.identify import (
-    DATA,
-    PRIOR,
-    TRAINING,
-    DataResult,
-    PriorResult,
-    TrainingResult,
-)
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, DataResult, PriorResult, TrainingResult
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, OnModelResult
 from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult
 from hybrid_mpc.workflow.stages.track import TRACK, TrackResult
