@@ -160,9 +160,9 @@ class _Links:
         """The strongest link to a column."""
         return max((self.of(one, target) for one in others if one is not target), default=0.0)
 
-    def out_of(self, source: Trait, others: Sequence[Trait], beside: Sequence[Trait] = ()) -> float:
+    def out_of(self, source: Trait, others: Sequence[Trait]) -> float:
         """The strongest link from a column."""
-        return max((self.of(source, one, beside=beside) for one in others if one is not source), default=0.0)
+        return max((self.of(source, one) for one in others if one is not source), default=0.0)
 
 
 def _link(source: Trait, target: Trait, stride: int, now: bool, beside: Sequence[Trait]) -> float:
