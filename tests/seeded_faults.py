@@ -288,7 +288,7 @@ FAULTS = (
     ),
     fault(
         "compare", "loops of machines with other parameters are taken for one another",
-        'if k not in ("number", "keep")', 'if k not in ("number", "keep", "parameters")',
+        'left_out = ("number", "keep", ', 'left_out = ("number", "keep", "parameters", ',
         "configuration",
     ),
     fault(

@@ -457,7 +457,6 @@ def _scaled(given: AnalysisInput, model: HybridModel, system: Any) -> Any:
 
 
 def _zeros(system: Any) -> Complex:
-    """Finite zeros of a system with as many inputs as outputs."""
     found = np.asarray(system.zeros(), dtype=np.complex128)
     # zeros larger than this are rounding errors: zeros at infinity (of a delay) that are computed as finite
     return found[np.abs(found) < 1e6]

@@ -10,13 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.machine.signals import nearest_turn
-from hybrid_mpc.model.equilibrium import (
-    RESIDUAL,
-    hidden_fixed_point,
-    natural_sizes,
-    residual_of,
-    rest_search,
-)
+from hybrid_mpc.model.equilibrium import RESIDUAL, hidden_fixed_point, natural_sizes, residual_of, rest_search
 from hybrid_mpc.model.limits import vector
 from hybrid_mpc.model.model import HybridModel
 
@@ -71,11 +65,7 @@ class Equilibria:
 
 
 def equilibria(
-    model: HybridModel,
-    u: ArrayLike,
-    region: Sequence[tuple[float, float]],
-    *,
-    starts: int = STARTS,
+    model: HybridModel, u: ArrayLike, region: Sequence[tuple[float, float]], *, starts: int = STARTS
 ) -> Equilibria:
     """Search equilibria ``(x, h)`` under a held input with ``x`` in a region, by Newton's method from many starts.
 

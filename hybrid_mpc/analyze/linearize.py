@@ -222,17 +222,13 @@ class FrictionSlopes:
     per_input: float
 
 
-def friction_slopes(
-    model: HybridModel, q: ArrayLike, speeds: ArrayLike, u: ArrayLike | None = None, *, axis: int = 0
-) -> FrictionSlopes:
-    """Compute the damping of one axis as tangent, secant, describing function and tangent in motion.
+def friction_slopes(model: HybridModel, q: ArrayLike, speeds: ArrayLike) -> FrictionSlopes:
+    """Compute the damping of the first axis for zero input: tangent, secant, describing function, tangent in motion.
 
     Args:
         model: The model, state ``[q, v]``.
         q: Positions ``(n_x / 2,)``.
         speeds: Amplitudes of the speed ``(n,)``, positive.
-        u: Input ``(n_u,)``. Default: zero.
-        axis: Number of the axis. Default: the first.
 
     Raises:
         InputError: If a size is wrong, a speed is not positive, or the hidden state has no equilibrium.
@@ -242,13 +238,9 @@ def friction_slopes(
     """
     n_q = positions_of(model)
     size = _positive(speeds, np.size(speeds))
-    if not 0 <= axis < n_q:
-        raise InputError(
-            f"friction: no axis {axis}; model {model.name} has axes 0 to {n_q - 1} [HM-ANALYZE-013]"
-        )
-    held = np.zeros(model.n_u) if u is None else vector(u, model.n_u, "u")
+    held = np.zeros(model.n_u)
     x = np.concatenate([vector(q, n_q, "q"), np.zeros(n_q)])
-    h, i = hidden_equilibrium(model, x, held), n_q + axis
+    h, i = hidden_equilibrium(model, x, held), n_q
     e = np.eye(model.n_x)[i]
 
     def acceleration(v: float) -> float:

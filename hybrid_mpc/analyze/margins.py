@@ -550,7 +550,6 @@ def mpc_loop(gain: MpcGain, filter: SteadyFilter, plant: Any, *, delay: int = 0)
 
 
 def _delay_inputs(plant: Any) -> Any:
-    """Delay the plant's inputs by one period."""
     a, b, c, _ = matrices(plant)
     n, n_u = b.shape
     whole = np.block([[a, b], [np.zeros((n_u, n + n_u))]])

@@ -152,39 +152,35 @@ def multisine_response(
     return _response(2 * np.pi * lines / period, uu, yy, np.conj(mean_u) * mean_y, float(periods))
 
 
-def run_plant(plant: Plant, x0: ArrayLike, dt: float, *, seed: int = 0, output: int = 0) -> Run:
-    """Wrap a simulated machine as a :data:`Run`, with its sensor noise.
+def run_plant(plant: Plant, x0: ArrayLike, dt: float) -> Run:
+    """Wrap a simulated machine as a :data:`Run` from its input to its first output, with sensor noise of seed 0.
 
     Args:
         plant: The machine.
         x0: Initial state ``(n_x,)``.
         dt: Period over which each input is held [s].
-        seed: Seed of the plant and of the noise. Default: 0.
-        output: Number of the output. Default: the first.
 
     Example:
         ``multisine_response(run_plant(scenario.plant(), [0.0, 0.0], 0.02), 0.02, amplitude=0.2, band=(0.1, 3.0))``
     """
 
     def run(u: Array) -> Array:
-        rng, state = np.random.default_rng(seed), plant.reset(np.asarray(x0, dtype=float), seed)
+        rng, state = np.random.default_rng(0), plant.reset(np.asarray(x0, dtype=float), 0)
         y = np.empty(u.size)
         for k, held in enumerate(u):
-            y[k] = np.ravel(plant.measure(state, rng))[output]
+            y[k] = np.ravel(plant.measure(state, rng))[0]
             state = plant.step(state, np.array([held]), dt)
         return y
 
     return run
 
 
-def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *, output: int = 0) -> Run:
-    """Wrap a model's free run as a :data:`Run`.
+def run_model(model: HybridModel, x0: ArrayLike) -> Run:
+    """Wrap a model's free run as a :data:`Run` from its input to its first output.
 
     Args:
         model: The model, with one input.
-        x0: Initial state ``(n_x,)``.
-        h0: Initial hidden state ``(n_h,)``. Default: zero.
-        output: Number of the output. Default: the first.
+        x0: Initial state ``(n_x,)``; a hidden state starts at zero.
 
     Raises:
         InputError: If the model has several inputs.
@@ -199,10 +195,10 @@ def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *,
         )
 
     def run(u: Array) -> Array:
-        x, h = np.asarray(x0, dtype=float), np.zeros(model.n_h) if h0 is None else np.asarray(h0, dtype=float)
+        x, h = np.asarray(x0, dtype=float), np.zeros(model.n_h)
         y = np.empty(u.size)
         for k, held in enumerate(u):
-            y[k] = float(model.output(x, held, model.w, model.p)[output])
+            y[k] = float(model.output(x, held, model.w, model.p)[0])
             x, h = model.step(x, h, held, model.w, model.p)
         return y
 
@@ -210,7 +206,6 @@ def run_model(model: HybridModel, x0: ArrayLike, h0: ArrayLike | None = None, *,
 
 
 def _check_power(signal: Array, what: str) -> None:
-    """Refuse a signal ``(n,)`` whose power is not finite."""
     wrong = np.flatnonzero(~(np.abs(signal) <= LARGEST))
     if wrong.size:
         raise InputError(

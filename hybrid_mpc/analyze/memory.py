@@ -331,9 +331,8 @@ class LyapunovExponent:
 
 
 def lyapunov_exponent(
-    model: HybridModel, x: ArrayLike, u: ArrayLike, h: ArrayLike | None = None,
-    *, part: Literal["all", "hidden"] = "all",
-) -> LyapunovExponent:  # fmt: skip
+    model: HybridModel, x: ArrayLike, u: ArrayLike, *, part: Literal["all", "hidden"] = "all"
+) -> LyapunovExponent:
     """Compute the largest Lyapunov exponent along a free run or a measured trajectory, by its tangent map.
 
     The tangent vector follows ``v_{k+1} = A_k v_k``; the exponent is the mean of ``log(|v_{k+1}| / |v_k|) / dt``. With
@@ -342,9 +341,8 @@ def lyapunov_exponent(
 
     Args:
         model: The model.
-        x: Initial state ``(n_x,)`` of a free run, or a trajectory ``(n, n_x)``.
+        x: Initial state ``(n_x,)`` of a free run, or a trajectory ``(n, n_x)``; a hidden state starts at zero.
         u: Inputs ``(n, n_u)``.
-        h: Initial hidden state ``(n_h,)``. Default: zero.
         part: ``"all"`` or ``"hidden"``. Default: ``"all"``.
 
     Raises:
@@ -361,8 +359,7 @@ def lyapunov_exponent(
         >>> round(lyapunov_exponent(model, [1.0], np.zeros((100, 1))).value, 6)  # log(0.9) / 0.1
         -1.053605
     """
-    along = linearize_along(model, x, u, h)
-    maps = along.A
+    maps = linearize_along(model, x, u).A
     if part == "hidden":
         if not model.n_h:
             raise InputError(

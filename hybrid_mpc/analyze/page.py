@@ -435,7 +435,6 @@ def _sections(result: AnalysisResult, tables: Mapping[str, Table], drawn: Drawn)
 
 
 def _leading(modes: Table) -> Table:
-    """Table of the first modes of each linearization."""
     rows: list[Sequence[Cell]] = []
     for row in modes.rows:
         if sum(r[:2] == row[:2] for r in rows) < MODES:

@@ -30,20 +30,20 @@ class Sensitivities:
         """Change of the states per relative change of each parameter (1 is 100 %), ``(n + 1, n_x, n_p)``."""
         return self.by * self.values
 
-    def apart(self, sigma: ArrayLike, *, share: float = 0.05) -> Sensitivities:
+    def apart(self, sigma: ArrayLike) -> Sensitivities:
         """Select the parameters that are identifiable together from this run, by a pivoted QR decomposition.
 
-        Each step selects the parameter whose effect has the largest part that the selected ones do not explain.
+        Each step selects the parameter whose effect has the largest part that the selected ones do not explain. A
+        parameter is left out if less than 5 % of its effect is independent of the selected ones.
 
         Args:
             sigma: Standard deviation of each state's error ``(n_x,)``; infinite for states that are not measured.
-            share: A parameter is left out if less than this share of its effect is independent of the selected ones.
         """
         rows = self._rows(sigma)
         size = np.linalg.norm(rows, axis=0)
         some = np.flatnonzero(size > 0)
         _, r, order = qr(rows[:, some] / size[some], mode="economic", pivoting=True)
-        keep = np.sort(some[order[: len(r)][np.abs(np.diag(r)) > share]])
+        keep = np.sort(some[order[: len(r)][np.abs(np.diag(r)) > 0.05]])
         return Sensitivities(
             tuple(self.names[i] for i in keep), self.values[keep], self.x, self.by[:, :, keep]
         )

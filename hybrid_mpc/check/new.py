@@ -498,7 +498,6 @@ def _unused(name: str, taken: Iterable[str]) -> str:
 
 
 def _speed_of(name: str, column: Column, lag: Lag, period: float, taken: Iterable[str]) -> tuple[str, Signal]:
-    """Name and signal of the second state of an output, its speed."""
     steps = np.diff(column.values) / period
     rms = float(np.sqrt(np.nanmean(steps**2))) if np.isfinite(steps).any() else 0.0
     # speeds with a larger rms are refused later: differentiated sensor noise must stay within
@@ -747,7 +746,6 @@ def _first_rest(draft: Draft, gains: Array, offsets: Array) -> tuple[list[float]
 
 
 def _within(value: float, column: Column) -> float:
-    """A value within the recorded range, rounded."""
     low, high = column.span
     return float(near(min(max(value, low), high), (high - low) / 500))
 

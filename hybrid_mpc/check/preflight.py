@@ -203,7 +203,6 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
 
 
 def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
-    """Check that the operating point is an equilibrium."""
     if moving := drift_at_rest(prior, second):
         x, u, _ = rest_of(prior)
         report.add(
@@ -542,7 +541,6 @@ def _check_task(
 
 
 def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal]) -> None:
-    """Check that values are within their signals' ranges."""
     for j, signal in enumerate(signals):
         beyond = (values[:, j] < signal.lower) | (values[:, j] > signal.upper)
         if beyond.any():

@@ -356,7 +356,6 @@ def _check_arguments(report: Report, prior: Prior, name: str, arguments: Sequenc
 
 
 def _call(prior: Prior, name: str, arguments: Sequence[str], what: str) -> None:
-    """Call one method, and check the shape of its result."""
     given = tuple((key, ca.SX.sym(key, len(prior.names_of(key)))) for key in arguments)
     if name == "balances":
         prior._balances(*given)
@@ -541,7 +540,6 @@ def _check_smooth(what: str, f: ca.Function, prior: Prior, points: Points) -> No
 
 
 def _check_clock(prior: Prior) -> None:
-    """Check that no state counts the time."""
     x, u, w, p = (ca.SX.sym(key, len(prior.names_of(key))) for key in POINT)
     rates = prior.equations.xdot(x, u, w, p)
     for state, rate in zip(prior.states, ca.vertsplit(rates), strict=True):

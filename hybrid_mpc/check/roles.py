@@ -160,9 +160,9 @@ class _Links:
         """The strongest link to a column."""
         return max((self.of(one, target) for one in others if one is not target), default=0.0)
 
-    def out_of(self, source: Trait, others: Sequence[Trait], beside: Sequence[Trait] = ()) -> float:
+    def out_of(self, source: Trait, others: Sequence[Trait]) -> float:
         """The strongest link from a column."""
-        return max((self.of(source, one, beside=beside) for one in others if one is not source), default=0.0)
+        return max((self.of(source, one) for one in others if one is not source), default=0.0)
 
 
 def _link(source: Trait, target: Trait, stride: int, now: bool, beside: Sequence[Trait]) -> float:
@@ -395,7 +395,6 @@ class _Judge:
                 self.copies.add(left.full)
 
     def _named(self) -> None:
-        """Roles by names."""
         kinds: dict[Role, Kind] = {
             "command": "input", "actuator": "input", "set-point": "set-point", "measured": "output",
             "quantity": "output", "disturbance": "disturbance", "flag": "none", "label": "none",
@@ -488,7 +487,6 @@ class _Judge:
                     self._say(trait, "none", "it is a switch without effect: a flag", False)
 
     def _by_unit(self) -> None:
-        """Units of inputs, and units of outputs."""
         driven = [t for t in self.open if t.unit in DRIVING_UNITS and t.said == "" and t.whole]
         if not self.of("input"):
             for trait in driven:
@@ -550,7 +548,6 @@ class _Judge:
         )
 
     def _answers(self) -> None:
-        """Measurements of drives whose command is recorded."""
         for trait in [t for t in self.open if t.said == "answer"]:
             self._say(trait, "none", "a drive's measurement of its command")
 

@@ -29,8 +29,7 @@ def analyze(
         typer.Option(help="The machine, a registered name or a .py file. Default: the machine of the model."),
     ] = "",
     data: Annotated[
-        list[Path] | None,
-        typer.Option(help="A recording for a frequency response; may be repeated."),
+        list[Path] | None, typer.Option(help="A recording for a frequency response; may be repeated.")
     ] = None,
     speed: Annotated[
         float | None, typer.Option(help="Size of the motions at which friction is linearized [unit of v].")

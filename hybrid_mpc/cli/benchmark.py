@@ -28,8 +28,7 @@ def benchmark(
         typer.Option(help="A recording for evaluation; may be repeated. Default: the held-out test data."),
     ] = None,
     model: Annotated[
-        Path | None,
-        typer.Option(help="Folder of an earlier benchmark: evaluate its model, train nothing."),
+        Path | None, typer.Option(help="Folder of an earlier benchmark: evaluate its model, train nothing.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder to create. Default: runs/MACHINE-benchmark.")

@@ -141,7 +141,9 @@ def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], ...]:
 
 def _fitted_parameters(prior: Prior, found: PriorResult) -> Table:
     """Values before and after the fit, with standard errors and bounds."""
-    table = _table("fitted parameters", "name", "nominal", "fitted", "standard error", "unit", "bounds", "")
+    table = make_table(
+        "fitted parameters", "name", "nominal", "fitted", "standard error", "unit", "bounds", ""
+    )
     ends = {one.parameter: f"at its bound {one.value:.4g}" for one in found.bounds}
     for one in prior.parameters:
         if not one.fixed:
@@ -161,10 +163,9 @@ def _error(value: float | None) -> str:
 
 
 def _free_runs(prior: Prior, found: PriorResult) -> Table:
-    """Errors of the prior and of simpler models in free runs."""
     length = "" if found.longest_run is None else f" of {found.longest_run:.3g} s"
     columns = [text for s in prior.outputs for text in (f"RMSE {s.label}", f"FIT {s.name} [%]")]
-    table = _table(f"free runs{length} on the test recordings", "model", "error [spreads]", *columns)
+    table = make_table(f"free runs{length} on the test recordings", "model", "error [spreads]", *columns)
     names = {"phy_nominal": "prior, nominal", "phy": "prior, fitted"}
     simpler = {name: one.errors for name, one in found.baselines.items()}
     for name, errors in {**found.errors, **simpler}.items():
@@ -226,7 +227,8 @@ def _line(console: Console, name: str, text: str) -> None:
     console.print(printable(f"{name}: {text}"), markup=False, soft_wrap=True)
 
 
-def _table(title: str, *columns: str) -> Table:
+def make_table(title: str, *columns: str) -> Table:
+    """An empty table whose cells fold where they are too long."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for column in columns:
         table.add_column(column, overflow="fold")
@@ -234,9 +236,8 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _signals(found: Preflight, prior: Prior, spec: DataSpec) -> Table:
-    """Signals with units, ranges and columns, and their recorded ranges."""
     recorded = found.dataset is not None
-    table = _table("signals", "", "name", "unit", "range", "column", *(["recorded"] if recorded else []))
+    table = make_table("signals", "", "name", "unit", "range", "column", *(["recorded"] if recorded else []))
     for role, signals, columns, key in (
         ("state", prior.states, (), ""), ("input", prior.inputs, spec.inputs, "u"),
         ("disturbance", prior.disturbances, spec.disturbances, "w"), ("output", prior.outputs, spec.outputs, "y"),
@@ -267,7 +268,7 @@ def _span(found: Preflight, key: str, j: int) -> str:
 
 
 def _parameters(prior: Prior) -> Table:
-    table = _table("parameters", "name", "value", "unit", "fitted between", "")
+    table = make_table("parameters", "name", "value", "unit", "fitted between", "")
     for one in prior.parameters:
         bounds = "fixed" if one.fixed else f"{one.lower:g} and {one.upper:g}"
         table.add_row(one.name, f"{one.value:g}", one.unit, bounds, one.description)
@@ -316,7 +317,7 @@ def _times(modes: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> str:
 def _recordings(found: Preflight) -> Table:
     assert found.dataset is not None
     data = found.dataset
-    table = _table("recordings", "file", "length", "sampled every", "training", "validation", "test")
+    table = make_table("recordings", "file", "length", "sampled every", "training", "validation", "test")
     seconds: dict[tuple[str, str], float] = {}
     for t in data.trajectories:
         seconds[t.file, t.role] = seconds.get((t.file, t.role), 0.0) + t.dt * len(t.t)

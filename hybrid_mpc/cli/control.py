@@ -120,7 +120,6 @@ def summary(results: ControlResults) -> list[str]:
 
 
 def _of_controller(results: ControlResults, name: str) -> ControlResults:
-    """The results of one controller."""
     return replace(
         results, on_model={name: results.on_model[name]}, step_ms={name: results.step_ms[name]},
         summary={task: {name: cells[name]} for task, cells in results.summary.items()},

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from hybrid_mpc.cli.check import make_table
 from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, ScenarioName, TimeColumn
 
 if TYPE_CHECKING:
@@ -88,11 +89,10 @@ def summary(found: ExplainResult, folder: Path) -> list[str]:
 
 
 def _steps(found: ExplainResult) -> Table:
-    """One row per step."""
     from hybrid_mpc.workflow.explain_page import RATIO, alternatives_of, signed, values_of
 
     explanation = found.explanation
-    table = _table("steps", "step", "held-out error [-]", RATIO, "fitted values", "alternatives")
+    table = make_table("steps", "step", "held-out error [-]", RATIO, "fitted values", "alternatives")
     table.add_row("prior, nominal", f"{explanation.nominal:.3g}", "", "", "")
     table.add_row("prior, fitted", f"{explanation.before:.3g}", "", "", "")
     for step in explanation.steps:
@@ -103,18 +103,10 @@ def _steps(found: ExplainResult) -> Table:
 
 
 def _tests(found: ExplainResult) -> Table:
-    """One row per model."""
     from hybrid_mpc.workflow.explain_page import MODELS
 
     labels = list(next(iter(found.tests.values())).rmse)
-    table = _table(found.tests_title, "model", "error [-]", *(f"RMSE {one}" for one in labels))
+    table = make_table(found.tests_title, "model", "error [-]", *(f"RMSE {one}" for one in labels))
     for name, one in found.tests.items():
         table.add_row(MODELS[name], f"{one.error:.3g}", *(f"{one.rmse[label]:.4g}" for label in labels))
-    return table
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(column, overflow="fold")
     return table

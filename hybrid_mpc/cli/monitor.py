@@ -40,8 +40,7 @@ def monitor(
         ),
     ] = 0.0,
     calibration: Annotated[
-        Path | None,
-        typer.Option(help="calibration.json with limits. Default: the model's."),
+        Path | None, typer.Option(help="calibration.json with limits. Default: the model's.")
     ] = None,
     residuals: Annotated[
         bool,
@@ -133,7 +132,6 @@ def summary(result: MonitorResult) -> list[str]:
 
 
 def _invalid(row: RecordingResult) -> str:
-    """Time without valid readings, with reasons."""
     parts = (
         (row.warm_up_s, "warm-up"),
         (row.missing_s, "samples are missing"),

@@ -31,6 +31,5 @@ EmptyFolder: TypeAlias = Annotated[
     Path, typer.Option(help="Folder to create; an existing one must be empty.")
 ]
 Scheduler: TypeAlias = Annotated[
-    str | None,
-    typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, instead of local processes."),
+    str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT, instead of local processes.")
 ]

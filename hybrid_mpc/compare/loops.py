@@ -719,20 +719,17 @@ def drawn_prior(prior: HybridModel) -> HybridModel | None:
     return replace(prior, name=DRAWN_PRIOR, parameters=parameters)
 
 
-def moves_otherwise(
-    one: HybridModel, other: HybridModel, inputs: tuple[Array, Array] | None = None, *, periods: int = 50
-) -> bool:
-    """Whether two models of a machine differ by more than rounding along a run from the operating point.
+def moves_otherwise(one: HybridModel, other: HybridModel, inputs: tuple[Array, Array] | None = None) -> bool:
+    """Whether two models of a machine differ by more than rounding along 50 periods from the operating point.
 
     Args:
         one: A model.
         other: Another model of the same signals.
         inputs: Lower and upper bounds ``(n_u,)`` of the random inputs. Default: the operating point plus and minus 1.
-        periods: Length of the run. Default: 50.
     """
     low, high = (one.u0 - 1.0, one.u0 + 1.0) if inputs is None else inputs
     low, high = np.where(np.isfinite(low), low, one.u0 - 1.0), np.where(np.isfinite(high), high, one.u0 + 1.0)
-    drawn = np.random.default_rng(0).uniform(low, high, (periods, one.n_u))
+    drawn = np.random.default_rng(0).uniform(low, high, (50, one.n_u))
     runs = []
     for model in (one, other):
         x, h, run = one.x0, hidden_fixed_point(model, one.x0, one.u0), []

@@ -29,6 +29,8 @@ AGEING, DRIFT_S = (1.0, 1.1, 0.9), 30.0
 must not alarm because of such ageing."""
 WEAKER = 0.8
 """Remaining share of the force of a weakened actuator."""
+LOAD = 0.2
+"""Unknown load at the first input, as a share of half the input's range."""
 
 
 def nominal_tasks(scenario: Scenario) -> list[Task]:
@@ -124,38 +126,21 @@ def broken(scenario: Scenario, model: HybridModel, control: OCP, start: float) -
         a load of 0.2 at u input_offset 0.2
         the sensor of phi freezes measurement_freeze 0.0
     """
-    found, end = [], math.inf
-    if knows(scenario, "plant_friction"):
-        found.append(Broken("friction", "friction doubles", Fault(start, end, "plant_friction", 2.0)))
-    found += [
-        Broken(
-            f"weak_{s.name}",
-            f"{s.name} loses a fifth of its force",
-            Fault(start, end, "input_gain", WEAKER, s.name),
-        )
-        for s in model.inputs
+    load, first = LOAD * 0.5 * float(control.input_range[0]), model.inputs[0].name
+    friction = [("friction", "friction doubles", "plant_friction", 2.0, "")]
+    cases = [
+        *(friction if knows(scenario, "plant_friction") else []),
+        *(
+            (f"weak_{s.name}", f"{s.name} loses a fifth of its force", "input_gain", WEAKER, s.name)
+            for s in model.inputs
+        ),
+        ("load", f"a load of {load:.3g} at {first}", "input_offset", load, first),
+        *(
+            (f"freeze_{s.name}", f"the sensor of {s.name} freezes", "measurement_freeze", 0.0, s.name)
+            for s in model.outputs
+        ),
     ]
-    load, first = unknown_load(control), model.inputs[0].name
-    found.append(
-        Broken("load", f"a load of {load:.3g} at {first}", Fault(start, end, "input_offset", load, first))
-    )
-    found += [
-        Broken(
-            f"freeze_{s.name}",
-            f"the sensor of {s.name} freezes",
-            Fault(start, end, "measurement_freeze", 0.0, s.name),
-        )
-        for s in model.outputs
+    return [
+        Broken(name, title, Fault(start, math.inf, target, value, channel))
+        for name, title, target, value, channel in cases
     ]
-    return found
-
-
-def unknown_load(control: OCP) -> float:
-    """Load of the demonstration at the first input [its unit].
-
-    Example:
-        >>> unknown_load(OCP(9, [1.0], [1.0] * 2, [1.0] * 2, u_min=[-5.0, -1.0], u_max=[0.0, 1.0]))
-        0.5
-    """
-    # unknown load, as a share of half the input's range
-    return 0.2 * float(0.5 * control.input_range[0])

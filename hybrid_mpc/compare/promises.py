@@ -555,7 +555,6 @@ def _compute_growth(point: SetPoint) -> float:
 
 
 def _explain_offset(point: SetPoint, result: ClosedLoopResult, errors: Array) -> str:
-    """Why a loop does not settle within the noise."""
     problem, model = point.problem, point.model
     late = slice(int((1.0 - END) * len(errors)), None)
     edge = AT_LIMIT * problem.input_range
@@ -783,7 +782,6 @@ def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Pr
 
 
 def _margins_at(point: SetPoint) -> list[tuple[Signal, Margins]]:
-    """Margins of a set-point's loop by input."""
     model, (x, u) = point.model, point.rest
     h = hidden_fixed_point(model, x, u, w=point.w)
     gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.w)
@@ -975,7 +973,6 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
 
 
 def _name_disturbance(model: HybridModel, j: int) -> str:
-    """Name of a disturbance."""
     chosen = model.disturbance_model
     if chosen is None:
         return f"the input {model.inputs[j].name}"
@@ -1073,6 +1070,5 @@ def _find_prior_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
 
 
 def _explain_longer_trial(longer: Trial) -> str:
-    """Text that says whether a slow loop settles in a longer trial."""
     seconds = len(longer.result.t) * longer.result.dt
     return f"in a loop of {seconds:.3g} s it {'does not settle either' if longer.why else 'settles'}"

@@ -234,7 +234,6 @@ def _group_rows(table: pd.DataFrame, by: Sequence[str]) -> Any:
 
 
 def _interval(values: Any) -> tuple[float, float]:
-    """Mean and half width of its 95 % interval; NaN if missing."""
     found = interval(np.asarray(values, dtype=float).tolist())
     return (math.nan if found.mean is None else found.mean, math.nan if found.ci95 is None else found.ci95)
 
@@ -395,7 +394,6 @@ TRACKING = "tracking_rmse "
 
 
 def _tracking(results: StudyResults, folder: Path) -> list[Section]:
-    """Tracking errors of every signal in its unit."""
     tables, figures = [], []
     for i, column in enumerate(c for c in results.figures if c.startswith(TRACKING)):
         label = f"RMSE of {column.removeprefix(TRACKING)}"

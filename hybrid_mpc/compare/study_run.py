@@ -197,7 +197,6 @@ class LoopRunner:
 
 @lru_cache(maxsize=1)
 def _load_bench(runner: LoopRunner) -> tuple[Bench, Lock]:
-    """The bench of a process, and a lock for its threads."""
     kits = {m.label: load(local_folder(m)).with_noise(dict(m.noise)) for m in runner.models}
     return Bench(load_scenario(runner.scenario), kits), Lock()
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_mpc.data.scales import robust_spread, time_unit
 from hybrid_mpc.data.trajectories import Trajectory
@@ -22,21 +23,26 @@ from hybrid_mpc.kit.assembly import make_estimator, tuned_noise
 from hybrid_mpc.kit.disturbances import default_disturbances
 from hybrid_mpc.scenario import Scenario
 
+Array = NDArray[np.float64]
 FITS = 4
 """Groups of recordings at most that are left out of a fit in turn."""
+
+
+def spread_of(recordings: Sequence[Array]) -> tuple[float, ...]:
+    """Spread of each column of recordings ``(n, m)``; 0 for a column that varies by rounding only."""
+    found = [
+        (robust_spread(c), float(np.nanmax(np.abs(c), initial=0.0))) for c in np.concatenate(recordings).T
+    ]
+    return tuple(spread if spread > 1e-9 * largest else 0.0 for spread, largest in found)
 
 
 def observer_of(scenario: Scenario, fit: PriorFit, train: Sequence[Trajectory]) -> Filter:
     """The observer that a run's kit has of the fitted prior."""
     dt, prior = scenario.data.dt, scenario.prior(fit.values)
     known = smoothed(scenario.prior, fit, train, dt)
-    spread = {
-        key: tuple(robust_spread(c) for c in np.concatenate([getattr(t, key) for t in known]).T)
-        for key in "xy"
-    }
     info = replace(
         model_info(prior, dt), input_delay=fit.delay, time_unit=time_unit(train, dt),
-        state_spread=spread["x"], output_spread=spread["y"],
+        state_spread=spread_of([t.x for t in known]), output_spread=spread_of([t.y for t in known]),
     )  # fmt: skip
     programs = {f"prior/{name}": p for name, p in prior_programs(prior, dt, fit.substeps).items()}
     model, chosen = build_model("prior", programs, info), scenario.disturbance_model

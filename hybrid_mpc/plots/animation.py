@@ -41,6 +41,8 @@ SIZE = (8.0, 4.1)  # [inch], with one curve and one input
 PANEL = 1.1  # height of each further curve or input [inch]
 GHOSTS = 6  # maximum number of planned positions in a frame
 PLAN = colour("hybrid")
+FPS = 25.0
+"""Largest number of frames a second; there is at most one frame a sample."""
 MOST_FRAMES = 250  # a longer loop gets fewer frames a second and still plays in real time
 LAST = 1.2  # duration of the last frame, before the animation starts again [s]
 
@@ -70,7 +72,6 @@ class Scene:
         curves: Sequence[tuple[int, Signal]],
         inputs: Sequence[Signal],
         limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None,
-        reference: Array | None,
     ) -> None:
         self._loop = loop
         self._columns = [column for column, _ in curves]
@@ -88,8 +89,8 @@ class Scene:
         self._live: list[tuple[Axes, Artist]] = []
         self._machine_panel(machine)
         self._curves: list[tuple[Line2D, Line2D, Line2D]] = []
-        for i, (ax, (column, signal)) in enumerate(zip(panels, curves, strict=False)):
-            self._curve_panel(ax, column, signal, None if reference is None else reference[:, i])
+        for ax, (column, signal) in zip(panels, curves, strict=False):
+            self._curve_panel(ax, column, signal)
         self._applied: list[Line2D] = []
         for i, (ax, signal) in enumerate(zip(panels[n:], inputs, strict=True)):
             self._input_panel(ax, i, signal, None if limits is None else (limits[0][i], limits[1][i]))
@@ -118,7 +119,6 @@ class Scene:
     def _body(
         self, ax: Axes, index: int, ink: str, alpha: float, width: float
     ) -> tuple[int, Line2D | Polygon]:
-        """Index and artist of one of the machine's moving lines."""
         if not _closed(self._loop.draw(self._loop.x[0])[index]):
             return index, self._line(ax, color=ink, linewidth=width, alpha=alpha, solid_capstyle="round")
         shape = Polygon([(0.0, 0.0)], color=ink, linewidth=0.0, alpha=alpha, zorder=2, animated=True)
@@ -170,15 +170,13 @@ class Scene:
         margin = 0.06 * max(float(np.max(high - low)), 1e-3)
         return low - margin, high + margin
 
-    def _curve_panel(self, ax: Axes, column: int, signal: Signal, reference: Array | None) -> None:
+    def _curve_panel(self, ax: Axes, column: int, signal: Signal) -> None:
         loop, values, planned = self._loop, self._loop.x[:, column], self._loop.plans[:, :, column]
         dress(ax)
-        if reference is not None:
-            ax.plot(loop.t, reference, color=FAINT, linewidth=1.2, label="reference")
         low, high = float(values.min()), float(values.max())
         room = 0.4 * max(high - low, 1e-6)  # so a diverging plan does not flatten the true motion
         seen = planned[np.isfinite(planned)]
-        seen = np.concatenate([seen, [low, high], [] if reference is None else reference])
+        seen = np.concatenate([seen, [low, high]])
         low, high = max(float(np.nanmin(seen)), low - room), min(float(np.nanmax(seen)), high + room)
         margin = 0.06 * max(high - low, 1e-6)
         ax.set_ylim(low - margin, high + margin)
@@ -269,11 +267,9 @@ def animate(
     draw: Draw,
     u: Array,
     title: str,
-    fps: float = 25,
     curves: Sequence[tuple[int, Signal]] | None = None,
     inputs: Sequence[Signal] | None = None,
     limits: tuple[Sequence[float] | Array, Sequence[float] | Array] | None = None,
-    reference: Array | None = None,
     alarm: Array | None = None,
     events: Sequence[tuple[float, str]] = (),
 ) -> Path:
@@ -293,18 +289,16 @@ def animate(
             order for every state.
         u: Inputs ``(n, n_u)``, held from ``t_k`` on.
         title: The loop in one line.
-        fps: Maximum frames a second; there is at most one frame a sample and 250 frames in total.
         curves: States with a curve: columns of ``x``, and signals for the axes. Default: all, named ``x_0, ...``,
             without units.
         inputs: Signals of ``u``. Default: ``u_0, ...`` without units.
         limits: Lower and upper bounds of the inputs, drawn as lines where finite. Default: none.
-        reference: References of the states with a curve, ``(n, len(curves))``. Default: none.
         alarm: Whether the monitor alarms ``(n,)``. Default: no monitor.
         events: Instants [s] and texts of events, such as a fault. Default: none.
 
     Raises:
         InputError: If the name does not end in ``.gif``, shapes do not fit, times do not increase, a true state
-            is not finite, or ``dt`` or ``fps`` is not positive.
+            is not finite, or ``dt`` is not positive.
 
     Example:
         >>> import tempfile
@@ -321,8 +315,8 @@ def animate(
         raise InputError(
             f"animation {path}: an animation is a GIF file; end its name with .gif [HM-PLOTS-010]"
         )
-    if not dt > 0 or not fps > 0:
-        raise InputError(f"animation {path}: dt and fps must be positive, got {dt} and {fps} [HM-PLOTS-011]")
+    if not dt > 0:
+        raise InputError(f"animation {path}: dt must be positive, got {dt} [HM-PLOTS-011]")
     loop = _checked(path, t, x, plans, dt, draw, u)
     n_u = loop.u.shape[1]
     signals = tuple(inputs) if inputs is not None else tuple(Signal(f"u_{i}", "-") for i in range(n_u))
@@ -336,11 +330,10 @@ def animate(
         raise InputError(
             f"animation {path}: curves must be states 0 to {loop.x.shape[1] - 1}, got {list(curves)} [HM-PLOTS-013]"
         )
-    target = None if reference is None else checked("reference", reference, len(loop.t), len(curves))
     if alarm is not None:
         loop = replace(loop, alarm=checked("alarm", alarm, len(loop.t)) > 0.5)
-    scene = Scene(replace(loop, events=tuple(events)), title, curves, signals, limits, target)
-    shown = _frames(loop.t, fps)
+    scene = Scene(replace(loop, events=tuple(events)), title, curves, signals, limits)
+    shown = _frames(loop.t)
     ends = np.append(loop.t[shown[1:]], loop.t[shown[-1]] + LAST)
     # GIF durations are hundredths of a second: the instants are rounded, not the durations, so no error accumulates.
     ticks = np.diff(np.round(100 * (ends - loop.t[0])).astype(int), prepend=0)
@@ -375,10 +368,10 @@ def _checked(path: Path, t: Array, x: Array, plans: Array, dt: float, draw: Draw
     return AnimatedLoop(t, x, u, plans, dt, draw, moving)
 
 
-def _frames(t: Array, fps: float) -> list[int]:
+def _frames(t: Array) -> list[int]:
     """Indices of the samples that are drawn: the first at or after each frame's instant, and the last sample."""
     length = float(t[-1] - t[0])
-    rate = min(fps, (MOST_FRAMES - 1) / length) if length > 0 else fps
+    rate = min(FPS, (MOST_FRAMES - 1) / length) if length > 0 else FPS
     instants = t[0] + np.arange(math.floor(length * rate + 1e-6) + 1) / rate
     chosen = np.searchsorted(t, instants - 1e-6 / rate)
     return sorted({*chosen.tolist(), len(t) - 1})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,38 +16,6 @@ WORDS = 38
 WAVES = 6.0
 """A term is drawn as a line while its total variation is at most this many times its range. A term beyond that also
 depends on another signal, and is drawn as points."""
-
-
-class Picture(Protocol):
-    """A term over its data (``identify.explanation.TermPicture``)."""
-
-    @property
-    def abscissa(self) -> str:
-        """Label of the horizontal axis."""
-
-    @property
-    def ordinate(self) -> str:
-        """Label of the vertical axis."""
-
-    @property
-    def at(self) -> Sequence[float]:
-        """Points on the horizontal axis that the recordings cover, increasing."""
-
-    @property
-    def term(self) -> Sequence[float]:
-        """Value of the term at each point."""
-
-    @property
-    def low(self) -> Sequence[float]:
-        """Value of the term minus two standard errors."""
-
-    @property
-    def high(self) -> Sequence[float]:
-        """Value of the term plus two standard errors."""
-
-    @property
-    def data(self) -> Sequence[float]:
-        """Value of the missing term according to the recordings; empty where they do not show it."""
 
 
 def error_steps(
@@ -96,31 +63,44 @@ def error_steps(
     return figure
 
 
-def term_over_data(picture: Picture) -> Figure:
+def term_over_data(
+    at: Sequence[float],
+    term: Sequence[float],
+    low: Sequence[float],
+    high: Sequence[float],
+    data: Sequence[float] = (),
+    *,
+    abscissa: str,
+    ordinate: str,
+) -> Figure:
     """A term over its data: the fitted law with two standard errors, and its values according to the recordings.
 
     Args:
-        picture: The term over its data.
+        at: Points on the horizontal axis that the recordings cover, increasing ``(n,)``.
+        term: Value of the term at each point ``(n,)``.
+        low: Value of the term minus two standard errors ``(n,)``.
+        high: Value of the term plus two standard errors ``(n,)``.
+        data: Value of the missing term according to the recordings ``(n,)``. Default: not drawn.
+        abscissa: Label of the horizontal axis.
+        ordinate: Label of the vertical axis.
 
     Example:
-        ``term_over_data(explanation.steps[0].pictures[0])``
+        ``term_over_data(**vars(explanation.steps[0].pictures[0]))``
     """
     figure, axes = new_figure(1, 1, size=(8.0, 3.6))
-    ax, at = axes[0, 0], np.array(picture.at)
-    low, high, term = (np.array(v) for v in (picture.low, picture.high, picture.term))
-    if len(picture.data):
-        data = np.array(picture.data)
+    ax = axes[0, 0]
+    if len(data):
         ax.plot(at, data, ".", color=FAINT, markersize=4, alpha=0.7, label="according to the recordings")
         reach = np.concatenate([low, high, np.quantile(data, [0.02, 0.98])])
         margin = 0.15 * (reach.max() - reach.min()) or 1.0
         ax.set_ylim(reach.min() - margin, reach.max() + margin)
     ax.fill_between(at, low, high, color=colour("phy"), alpha=0.25, linewidth=0, label="two standard errors")
-    line = np.abs(np.diff(term)).sum() <= WAVES * (term.max() - term.min())
+    line = np.abs(np.diff(term)).sum() <= WAVES * np.ptp(term)
     ax.plot(
         at, term, "-" if line else ".", color=colour("phy"), linewidth=1.8, markersize=5, label="the term"
     )
-    ax.set_xlabel(plain(picture.abscissa))
-    ax.set_ylabel(_break_lines(plain(picture.ordinate)))
+    ax.set_xlabel(plain(abscissa))
+    ax.set_ylabel(_break_lines(plain(ordinate)))
     shared_legend(figure)
     return figure
 

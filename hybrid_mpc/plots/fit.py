@@ -132,7 +132,7 @@ def free_run(
 
 
 def input_correlations(
-    lags: Array, found: Mapping[str, Mapping[tuple[str, str], tuple[Array, float]]], *, title: str = ""
+    lags: Array, found: Mapping[str, Mapping[tuple[str, str], tuple[Array, float]]]
 ) -> Figure:
     """Correlation of free-run errors with each earlier input, one panel for each pair of input and output.
 
@@ -140,7 +140,6 @@ def input_correlations(
         lags: Lags ``(m,)`` [s] of the error behind the input.
         found: By model and ``(input, output)``: correlations ``(m,)``, and half the width of the band of independent
             signals.
-        title: Title. Default: none.
 
     Example:
         >>> lags = np.arange(3) * 0.1
@@ -148,7 +147,7 @@ def input_correlations(
         1
     """
     pairs = list(dict.fromkeys(pair for own in found.values() for pair in own))
-    figure, panels = new_column([1.2] * len(pairs), title=title)
+    figure, panels = new_column([1.2] * len(pairs))
     for ax, pair in zip(panels, pairs, strict=True):
         ax.axhline(0.0, color=FAINT, linewidth=0.8)
         for model, own in found.items():

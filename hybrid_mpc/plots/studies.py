@@ -168,7 +168,6 @@ def _panels(
 
 
 def _rows(ax: Axes, names: Sequence[str]) -> None:
-    """Label the rows, the first at the top."""
     ax.set_yticks(range(len(names)), [plain(name) for name in names], fontsize=8)
     ax.set_ylim(len(names) - 0.4, -0.6)
     ax.grid(False, axis="y")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,37 +21,20 @@ STATES: Mapping[str, tuple[str, str, str]] = {
 LABEL = "validation E_sim, best network [-]"
 
 
-class Trial(Protocol):
-    """A training with its settings (``identify.tune.TrialRow``)."""
-
-    @property
-    def number(self) -> int:
-        """Number of the trial: 0, 1, ..."""
-
-    @property
-    def state(self) -> str:
-        """A key of :data:`STATES`."""
-
-    @property
-    def value(self) -> float:
-        """Validation error; infinite where the training diverged."""
-
-    @property
-    def values(self) -> Mapping[str, float]:
-        """The searched settings."""
-
-
-def history(trials: Sequence[Trial], *, base: float | None = None) -> Figure:
+def history(states: Sequence[str], values: Sequence[float], *, base: float | None = None) -> Figure:
     """Validation error over the number of the trial, with the best error so far.
 
-    ``base`` is the validation error of the initial settings; by default it is not drawn.
+    Args:
+        states: State of each trial ``(n,)``, keys of :data:`STATES`.
+        values: Validation errors ``(n,)``; infinite where the training diverged.
+        base: Validation error of the initial settings. Default: not drawn.
     """
     figure, axes = new_figure(1, 1)
     ax = axes[0, 0]
-    _points(ax, trials, [float(trial.number) for trial in trials])
-    done = [trial for trial in trials if trial.state == "complete"]
-    best = np.minimum.accumulate([trial.value for trial in done])
-    ax.step([t.number for t in done], best, color=INK, linewidth=1.2, where="post", label="best so far")
+    _points(ax, range(len(values)), states, values)
+    done = [number for number, state in enumerate(states) if state == "complete"]
+    best = np.minimum.accumulate([values[number] for number in done])
+    ax.step(done, best, color=INK, linewidth=1.2, where="post", label="best so far")
     if base is not None:
         ax.axhline(base, color=FAINT, linestyle="--", linewidth=1.2, label="settings it started from")
     ax.set_xlabel("trial [-]")
@@ -62,16 +44,17 @@ def history(trials: Sequence[Trial], *, base: float | None = None) -> Figure:
     return figure
 
 
-def settings(trials: Sequence[Trial], names: Sequence[str]) -> Figure:
-    """Validation error over each searched setting, one panel for each setting."""
-    if not names:
+def settings(
+    searched: Mapping[str, Sequence[float]], states: Sequence[str], values: Sequence[float]
+) -> Figure:
+    """Validation error over each ``searched`` setting ``(n,)``, one panel each; the rest as in :func:`history`."""
+    if not searched:
         raise InputError(
             "plot of a search: no setting to draw; pass the names of searched settings [HM-PLOTS-034]"
         )
-    figure, axes = new_figure(1, len(names), sharey=True)
-    for ax, name in zip(axes[0], names, strict=True):
-        at = [float(trial.values[name]) for trial in trials]
-        _points(ax, trials, at)
+    figure, axes = new_figure(1, len(searched), sharey=True)
+    for ax, (name, at) in zip(axes[0], searched.items(), strict=True):
+        _points(ax, at, states, values)
         ax.set_xscale("log")
         plain_log(ax.xaxis, min(at), max(at))
         ax.set_xlabel(f"{'hidden units z' if name == 'hidden' else plain(name.replace('_', ' '))} [-]")
@@ -80,9 +63,9 @@ def settings(trials: Sequence[Trial], names: Sequence[str]) -> Figure:
     return figure
 
 
-def _points(ax: Axes, trials: Sequence[Trial], at: Sequence[float]) -> None:
+def _points(ax: Axes, at: Sequence[float], states: Sequence[str], values: Sequence[float]) -> None:
     """Draw one point for each trial on a logarithmic axis; an infinite value lies at the upper edge."""
-    finite = [trial.value for trial in trials if math.isfinite(trial.value) and trial.value > 0]
+    finite = [value for value in values if math.isfinite(value) and value > 0]
     if not finite:
         raise InputError(
             "plot of a search: no trial has a finite, positive validation error; there is nothing to draw"
@@ -93,6 +76,6 @@ def _points(ax: Axes, trials: Sequence[Trial], at: Sequence[float]) -> None:
     ax.set_ylim(low, high)
     plain_log(ax.yaxis, low, high)
     for state, (marker, ink, label) in STATES.items():
-        points = [(x, min(t.value, high)) for x, t in zip(at, trials, strict=True) if t.state == state]
+        points = [(x, min(v, high)) for x, s, v in zip(at, states, values, strict=True) if s == state]
         if points:
             ax.plot(*zip(*points, strict=True), marker, color=ink, label=label, clip_on=False, zorder=3)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -269,7 +268,16 @@ def choice_of_benchmark(context: Context) -> BenchmarkChoice:
     data, found, warm_up = context.recordings, choice_stage(context), context.spec.warm_up
     linear = linear_models(context)
     fitted = {name: own for name, own in linear.items() if not isinstance(own, str)}
-    errors = partial(candidate_errors, context, context.networks(found), fitted)
+    spec, fit, networks = benchmark_of(context.scenario), context.prior.fit, context.networks(found)
+    prior = context.scenario.prior(fit.values)
+
+    def errors(over: Sequence[Trajectory], warm_up: float) -> dict[str, OutputErrors]:
+        runs = run_freely(
+            prior, fit, networks, context.cut(over, warm_up), warm_up=warm_up, length=context.run_length,
+            linear=fitted,
+        )  # fmt: skip
+        return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
+
     validation = errors(data.valid, max(warm_up, IN_MOTION * context.time_unit))
     long = errors(data.long, warm_up) if data.long else {}
     hybrid = recommended(
@@ -288,21 +296,6 @@ def choice_of_benchmark(context: Context) -> BenchmarkChoice:
         linear=fitted,
         no_linear={name: why for name, why in linear.items() if isinstance(why, str)},
     )
-
-
-def candidate_errors(
-    context: BenchmarkContext,
-    networks: Mapping[str, Trained],
-    linear: Mapping[str, LinearModel],
-    trajectories: Sequence[Trajectory],
-    warm_up: float,
-) -> dict[str, OutputErrors]:
-    """Errors of every model's free runs after a warm-up of ``warm_up`` [s]."""
-    spec, fit = benchmark_of(context.scenario), context.prior.fit
-    prior = context.scenario.prior(fit.values)
-    over, length = context.cut(trajectories, warm_up), context.run_length
-    runs = run_freely(prior, fit, networks, over, warm_up=warm_up, length=length, linear=linear)
-    return {name: run_error(runs, name, prior.outputs, spec) for name in runs[0].y_hat}
 
 
 PRIOR_OF_BENCHMARK = replace(PRIOR, compute=prior_of_benchmark)
@@ -431,7 +424,6 @@ def recommended(
 
 
 def _note(settings: BenchmarkSettings, scenario: Scenario, data: Recordings) -> JobNote:
-    """The note of a benchmark in its folder: another benchmark there is refused."""
     pieces = digest([[p.role, p.name, p.t[0], p.t[-1]] for p in (*data.train, *data.valid, *data.held_back)])
     own = _Note(scenario.name, data.dataset.hash, scenario.data.dt, settings.budget, settings.seed, pieces)
     return JobNote(NOUN, plain(own))
@@ -468,7 +460,6 @@ def _evaluated(
     warnings: Sequence[str],
     refit: float | None,
 ) -> BenchmarkResults:
-    """The results of the stages, and free runs over the test files."""
     progress, scenario, settings = context.progress, context.scenario, context.settings
     progress.start("free runs over the test files")
     choice = context.read(CHOICE_OF_BENCHMARK)

@@ -263,34 +263,23 @@ def run_freely(
     if length is not None:
         n = warm + round(length / dt) + 1
         starts = [t.part(np.arange(len(t.t)) < n, t.name, t.role) for t in starts]
-    after = slice(1, -1)  # without the initial state and the state after the last input
-    found = {"phy": model_states(PriorStep(prior, dt, fit.substeps), starts, warm)[:, after]}
+    states = {"phy": model_states(PriorStep(prior, dt, fit.substeps), starts, warm)}
     for kind, trained in networks.items():
-        found[kind] = model_states(trained.step(prior, dt), starts, warm)[:, after]
-    longest, n_y = max(len(t.t) for t in starts), len(prior.outputs)
-    u, w = (np.stack([_padded(getattr(t, key), longest)[warm + 1 :] for t in starts]) for key in ("u", "w"))
-    held = np.concatenate(u).T, np.concatenate(w).T, prior.p
-    outputs = {
-        name: measured_as(
-            prior,
-            prior.equations.output(x.reshape(-1, x.shape[-1]).T, *held).full().T.reshape(*x.shape[:2], n_y),
-        )
-        for name, x in found.items()
-    }
+        states[kind] = model_states(trained.step(prior, dt), starts, warm)
     first = lost_samples(fit.delay, dt) + warm + 1  # linear models use the inputs as commanded
     whole = [t.part(slice(0, first + len(s.t) - warm - 1)) for t, s in zip(trajectories, starts, strict=True)]
     straight = {name: model.free_runs(whole, first) for name, model in (linear or {}).items()}
-    return [
-        BenchmarkRun(
-            t.name,
-            t.t[warm + 1 :],
-            t.u[warm + 1 :],
-            t.y[warm + 1 :],
-            {name: y[i, : len(t.t) - warm - 1] for name, y in outputs.items()}
-            | {name: measured_as(prior, y[i]) for name, y in straight.items()},
-        )
-        for i, t in enumerate(starts)
-    ]
+    found = []
+    for i, t in enumerate(starts):
+        after = slice(warm + 1, None)  # without the initial state and the state after the last input
+        u, n = t.u[after], len(t.t) - warm
+        y_hat = {
+            name: prior.equations.output(x[i, 1:n].T, u.T, t.w[after].T, prior.p).full().T
+            for name, x in states.items()
+        } | {name: y[i] for name, y in straight.items()}
+        clipped = {name: measured_as(prior, y) for name, y in y_hat.items()}
+        found.append(BenchmarkRun(t.name, t.t[after], u, t.y[after], clipped))
+    return found
 
 
 def scored_signals(outputs: Sequence[Signal], spec: BenchmarkSpec) -> list[tuple[Signal, float]]:
@@ -328,8 +317,3 @@ def run_error(
     return output_errors(
         [scaled * run.y_hat[name] for run in runs], [scaled * run.y for run in runs], signals
     )
-
-
-def _padded(values: Array, length: int) -> Array:
-    """Rows up to a length; the last row is repeated."""
-    return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

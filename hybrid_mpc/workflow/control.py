@@ -55,13 +55,6 @@ class FaultNote:
 
 
 @dataclass(frozen=True)
-class Origin:
-    """Origin of the model."""
-
-    provenance: Provenance
-
-
-@dataclass(frozen=True)
 class ControlResults:
     """Content of ``results.json`` of ``hybrid-mpc control`` (docs/control-results.md): settings, every loop, and means.
 
@@ -83,7 +76,7 @@ class ControlResults:
     faults: tuple[FaultNote, ...]
     guard: WatchLimits | None
     reaction: str
-    model: Origin
+    model: Mapping[str, Provenance]
     noise: NoiseNote
     versions: Mapping[str, str]
     period_ms: float
@@ -124,7 +117,6 @@ def run_control(
 
 
 def _rows(bench: Bench, study: Study, model: StudyModel, folder: Path, progress: Progress) -> list[LoopRow]:
-    """Rows of all loops: read those that the folder holds, run the others."""
     first, specs = study.loop_seeds[0], dict[str, list[LoopSpec]]()
     for spec in study.runs():
         arrays = ("step_ms", *((*DRAWN, "plans", "alarm") if spec.seed == first else ()))
@@ -163,7 +155,7 @@ def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[Loop
         faults=tuple(FaultNote(f.target, f.value, f.channel, f.start, f.end) for f in faults),
         guard=kit.limits("hybrid") if study.guard else None,
         reaction=study.guard,
-        model=Origin(kit.provenance),
+        model={"provenance": kit.provenance},
         noise=NoiseNote(model.noise_source, {name: tuple(kit.noise(name).tolist()) for name in filters}),
         versions=versions(),
         period_ms=1e3 * kit.models["prior"].dt,

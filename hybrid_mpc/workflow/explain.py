@@ -10,18 +10,18 @@ from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.data.trajectories import Dataset, load_trajectories
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError, named_extra, no_exit
-from hybrid_mpc.files import read_json, write_json, write_text
+from hybrid_mpc.files import write_json, write_text
 from hybrid_mpc.folder import JobNote, open_folder, versions
 from hybrid_mpc.identify.explain import STEPS
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.specification import Role
-from hybrid_mpc.records import record
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import write_page
 from hybrid_mpc.workflow.explain_search import Search, chosen_terms, prior_class
 from hybrid_mpc.workflow.explained import ExplainResult, scenario_code
 from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stages.identify import check_source
 
 SCHEMA, SCHEMA_VERSION = "hybrid-mpc explain", 1
 RESULT = "explain.json"
@@ -68,11 +68,7 @@ def explain(
     chosen = chosen_terms(scenario, terms)
     context = Context(settings, scenario, out, progress or Progress())
     check_scenario(replace(scenario, plant=None, oracle=None, control=None, tasks=()))
-    if not settings.data and scenario.make_data is None:
-        raise InputError(
-            f"scenario {scenario.name}: no recordings. It cannot simulate them; give recordings of the machine with "
-            "--data FILE.csv, once for each file [HM-WORKFLOW-019]"
-        )
+    check_source(context)
     make = prior_class(scenario)
     # bad recordings leave no folder behind
     data = _recordings(context, make) if settings.data else None
@@ -83,16 +79,6 @@ def explain(
         found = Search(context, make, data, chosen, out, most).result()
         write(context, found, out, ["explain", settings.scenario, *settings.options(str), "--out", str(out)])
         return found
-
-
-def read_result(out: Path) -> ExplainResult:
-    """Read the result of :func:`explain` from a folder.
-
-    Raises:
-        InputError: If it is missing or damaged.
-    """
-    held = read_json(out / RESULT)
-    return record(ExplainResult, held.get("result") if isinstance(held, dict) else held, str(out / RESULT))
 
 
 def _recordings(context: Context, make: type[Prior]) -> Dataset:

@@ -34,8 +34,7 @@ def write_page(out: Path, scenario: Scenario, found: ExplainResult, command: Seq
     drawn = []
     for number, step in enumerate(explanation.steps, 1):
         for k, picture in enumerate(step.pictures, 1):
-            figure = plots.term_over_data(picture)
-            path = save(figure, out / "figures" / f"step_{number}_{k}.png")
+            path = save(plots.term_over_data(**vars(picture)), out / "figures" / f"step_{number}_{k}.png")
             drawn.append((path, f"Step {number}: {picture.ordinate.partition(' [')[0]} over its data."))
     sections = [
         Section(

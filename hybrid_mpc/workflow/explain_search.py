@@ -104,7 +104,6 @@ def _law(candidate: Candidate) -> str:
 
 
 def _names(candidate: Candidate) -> set[str]:
-    """Names of its parameters and states."""
     names = {name for form in candidate.forms for name in form.names}
     return names | {form.state.name for form in candidate.forms if form.state is not None}
 

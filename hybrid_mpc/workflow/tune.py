@@ -112,7 +112,6 @@ def usage(settings: RunSettings, out: Path) -> str:
 
 
 def _write(context: Context, settings: TuneSettings, found: SearchResult) -> None:
-    """Settings, table, figures, and results.json last."""
     out, names = context.out, settings.space.names
     fields = dict.fromkeys("learning_rates" if name in RATES else name for name in names)
     best = {name: getattr(found.settings, name) for name in fields}
@@ -140,7 +139,9 @@ def _write(context: Context, settings: TuneSettings, found: SearchResult) -> Non
     ]
     columns = ("number", "state", "value", "mean", "steps", "duration_s", *names)
     write_text(out / "trials.csv", Table(columns, rows).csv())
-    save(plots.history(found.trials, base=found.base), out / "figures" / "tune_history.png")
-    save(plots.settings(found.trials, names), out / "figures" / "tune_settings.png")
+    drawn = [t.state for t in found.trials], [t.value for t in found.trials]
+    searched = {name: [t.values[name] for t in found.trials] for name in names}
+    save(plots.history(*drawn, base=found.base), out / "figures" / "tune_history.png")
+    save(plots.settings(searched, *drawn), out / "figures" / "tune_settings.png")
     write_json(out / "settings.json", best)
     write_json(out / "results.json", results)

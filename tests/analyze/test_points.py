@@ -54,13 +54,6 @@ def test_continuous_linearisation_of_the_golf_robot_is_the_one_by_hand(golf, phi
     assert sys.dt == 0
 
 
-@pytest.mark.parametrize("phi", [0.0, 0.5, np.pi])
-def test_continuous_linearisation_of_a_pendulum_is_the_one_by_hand(phi):
-    sys = linearize(pendulum_model(friction=0.0), [phi, 0.3], [0.0], continuous=True)
-    assert np.abs(sys.A - [[0.0, 1.0], [-2.4 * np.cos(phi) / 0.14, -0.02 / 0.14]]).max() < 1e-10
-    assert np.abs(sys.B - [[0.0], [1 / 0.14]]).max() < 1e-10
-
-
 def test_a_hidden_state_has_no_continuous_form():
     with pytest.raises(InputError, match="HM-ANALYZE-011"):
         linearize(pendulum_model(4), [0.0, 0.0], [0.0], continuous=True)

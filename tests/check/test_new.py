@@ -2,7 +2,6 @@
 
 import ast
 import csv
-import os
 import re
 import shlex
 import sys
@@ -421,19 +420,6 @@ def test_the_command_that_is_proposed_is_one_command(call, tmp_path, monkeypatch
         name,
     ]
     assert "\x1b" not in told
-
-
-def test_the_header_that_was_executed(call, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    u = np.repeat(np.random.default_rng(0).standard_normal(20), 5)
-    rows = [
-        f"{0.1 * k},{v},{w}" for k, (v, w) in enumerate(zip(u, np.convolve(u, np.ones(9))[:100], strict=True))
-    ]
-    Path("a.csv").write_text("\n".join([PWNED, *rows]))
-    assert call("new", "m.py", "--data", "a.csv")[0] == 0
-    assert call("check", "m.py", "--data", "a.csv")[0] == 0
-    assert not Path("pwned").exists()
-    assert sorted(os.listdir()) == ["a.csv", "m.py"]
 
 
 # Time

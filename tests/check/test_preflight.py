@@ -225,7 +225,6 @@ WRONG = {
         field(prior=type("Empty", (Prior,), {k: getattr(Tank, k) for k in ("states", "inputs", "outputs")})),
         "HM-CHECK-061",
     ),
-    "disturbances": (prior(disturbances=(Signal("wind", "m/s"),)), "HM-DATA-129"),
     # a mechanical prior
     "zero inertia": (prior(mass_matrix=lambda self, q, p: 0.0 * p.J), "HM-CHECK-049"),
     "no inertia": (prior(mass_matrix=MechanicalPrior.mass_matrix), "HM-CHECK-061"),
@@ -356,20 +355,6 @@ def test_every_wrong_scenario_is_told(changes, code):
         check_scenario(dataclasses.replace(GOOD, **changes()))
 
 
-def test_all_problems_are_told_at_once():
-    wrong = {
-        **prior(mass_matrix=lambda self, q, p: None)(),
-        **field(sensor_sigma=(0.0,))(),
-        **task(x0=(0.0,))(),
-    }
-    with pytest.raises(InputError) as told:
-        check_scenario(dataclasses.replace(GOOD, **wrong))
-    message = str(told.value)
-    assert "3 problems" in message
-    for word in ("mass_matrix", "sensor_sigma", "x0 must have 2"):
-        assert word in message
-
-
 def test_a_problem_with_prices_asks_for_them_in_the_reference():
     x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p")
     priced = dataclasses.replace(
@@ -475,10 +460,7 @@ def test_set_points_of_outputs_measured_disturbances_and_a_disturbance_model_pas
     ("changed", "words"),
     [
         (lambda t: filled(2.5)(t), ["reference: lower [m] is 2.5 at 20 s, outside its range 0 to 2"]),
-        (
-            lambda t: np.zeros((len(t), 2)),
-            ["reference: must return shape (60, 1) for 60 times, got (60, 2)"],
-        ),
+        (lambda t: np.zeros((len(t), 2)), ["reference: must return shape (60, 1) for 60 times, got (60, 2)"]),
     ],
     ids=["beyond the range", "of the states"],
 )

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import matplotlib
@@ -319,3 +320,11 @@ def test_bars_of_two_hybrids_differ_by_their_hatching():
     first, second = figure.axes[0].patches
     assert first.get_facecolor() == second.get_facecolor()
     assert (first.get_hatch(), second.get_hatch()) == ("///", None)
+
+
+def test_a_character_that_the_font_lacks_warns_of_nothing(tmp_path):
+    figure, _ = new_figure(1, 1)
+    figure.suptitle("\x1b[2J 名 \u202e")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert save(figure, tmp_path / "a.png").stat().st_size > 100

@@ -22,14 +22,7 @@ def errors_figure():
 def run_figure():
     t = 0.1 * np.arange(30)
     x = np.column_stack([np.sin(t), np.cos(t)])
-    run = {
-        "t": t,
-        "u": x[:, :1],
-        "x": x,
-        "x_hat": 1.1 * x,
-        "balances": x[:, :1],
-        "balances_hat": x[:, 1:],
-    }
+    run = {"t": t, "u": x[:, :1], "x": x, "x_hat": 1.1 * x, "balances": x[:, :1], "balances_hat": x[:, 1:]}
     states, inputs = [Signal("phi", "rad"), Signal("phi_dot", "rad/s")], [Signal("u", "N m")]
     return shown_free_run({"phy": run, "mopgrnn": run}, states, inputs)
 

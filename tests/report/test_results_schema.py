@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from hybrid_mpc import InputError
+from hybrid_mpc.files import write_json
 from hybrid_mpc.records import plain
 from hybrid_mpc.workflow.run import STAGES
 from hybrid_mpc.workflow.stage import Absent
-from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, read_results, write_results
+from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, read_results
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "tests" / "golden" / "results.json"
@@ -41,7 +42,7 @@ def changed(tmp_path):
 
 def test_results_are_read_and_written_back(tmp_path):
     results = read_results(RESULTS)
-    write_results(tmp_path / "again.json", results)
+    write_json(tmp_path / "again.json", plain(results))
     assert (tmp_path / "again.json").read_text() == RESULTS.read_text()
     assert read_results(tmp_path / "again.json") == results
 

@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 from closed_loop_parts import loop_row
 
-from hybrid_mpc import (
-    InputError,
-    RunSettings,
-    Signal,
-    load,
-    load_scenario,
-    set_limits,
-    set_process_noise,
-)
+from hybrid_mpc import InputError, RunSettings, Signal, load, load_scenario, set_limits, set_process_noise
 from hybrid_mpc.compare.controllers import COMPARED, CONTROLLERS, ORACLES
 from hybrid_mpc.compare.loops import MODEL, LoopSpec, limits_used
 from hybrid_mpc.compare.sequential import looks

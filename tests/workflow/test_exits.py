@@ -122,10 +122,7 @@ def test_a_terminal_without_a_character_gets_its_number(tmp_path):
     path.write_text(path.read_text().replace('title=""', 'title="Behälter ≤ 3"'))
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     ended = subprocess.run(
-        [sys.executable, "-m", "hybrid_mpc", "check", path],
-        env=environment,
-        capture_output=True,
-        text=True,
+        [sys.executable, "-m", "hybrid_mpc", "check", path], env=environment, capture_output=True, text=True
     )
     assert ended.returncode == 0, ended.stderr
     assert r"Beh\xe4lter \u2264 3" in ended.stdout

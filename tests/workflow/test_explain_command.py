@@ -15,9 +15,10 @@ from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.data.scales import time_unit
 from hybrid_mpc.identify.explain import ADDED
 from hybrid_mpc.plots.explain import error_steps
+from hybrid_mpc.records import plain
 from hybrid_mpc.workflow import explain_page, explain_search
 from hybrid_mpc.workflow.context import Context
-from hybrid_mpc.workflow.explain import read_result
+from hybrid_mpc.workflow.explain import RESULT
 from hybrid_mpc.workflow.explain_search import chosen_terms
 from hybrid_mpc.workflow.explained import scenario_code
 from hybrid_mpc.workflow.stage import bring_up_to_date
@@ -50,18 +51,13 @@ def test_the_missing_friction_is_found(explained):
     assert told.after.ratio < 0.5
     assert told.nominal > told.before > told.steps[0].held_out.error > found.floor > 0
     assert found.tests["nominal"].error > found.tests["fitted"].error > 2 * found.tests["explained"].error
-    assert read_result(out) == found
+    assert json.loads((out / RESULT).read_text())["result"] == plain(found)
 
 
 def test_its_page_shows_the_steps_and_the_term(explained):
     out, found = explained
     page = (out / "explain.html").read_text()
-    for words in (
-        "Coulomb friction of phi_dot",
-        "-F_c_phi_dot sign(phi_dot)",
-        found.file,
-        "sensor noise",
-    ):
+    for words in ("Coulomb friction of phi_dot", "-F_c_phi_dot sign(phi_dot)", found.file, "sensor noise"):
         assert words in page
     assert {p.name for p in (out / "figures").iterdir()} == {"error_by_step.png", "step_1_1.png"}
     assert page.count("data:image/png") == 2

@@ -14,12 +14,7 @@ from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.predict import predict
 from hybrid_mpc.workflow import benchmark as job_benchmark
-from hybrid_mpc.workflow.benchmark import (
-    BenchmarkContext,
-    BenchmarkSettings,
-    benchmark,
-    read_benchmark,
-)
+from hybrid_mpc.workflow.benchmark import BenchmarkContext, BenchmarkSettings, benchmark, read_benchmark
 from hybrid_mpc.workflow.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
 from hybrid_mpc.workflow.predict import read_recordings_of
 from hybrid_mpc.workflow.settings import RunSettings

@@ -15,14 +15,7 @@ import pytest
 from patience import HANGS
 
 from hybrid_mpc import InputError, load
-from hybrid_mpc.kit.parts import (
-    KIT,
-    OWNERS,
-    PROGRAMS,
-    WEIGHTS,
-    read_description,
-    write_description,
-)
+from hybrid_mpc.kit.parts import KIT, OWNERS, PROGRAMS, WEIGHTS, read_description, write_description
 from hybrid_mpc.workflow.stages.results import read_results
 
 

@@ -68,15 +68,7 @@ def own(machine, finished, arguments, tmp_path, monkeypatch):
         pytest.param(
             r"q=\(",
             "q=(2.0 * ",
-            [
-                "tasks",
-                "control",
-                "on_model",
-                "promises",
-                "watch",
-                "analysis",
-                "report",
-            ],
+            ["tasks", "control", "on_model", "promises", "watch", "analysis", "report"],
             marks=pytest.mark.full,
         ),
         ("$", "\n# a remark\n", []),

@@ -94,14 +94,7 @@ def context(machine, samples, out, warm_up):
         smoothing=10 * machine.dt,
         warm_up=warm_up,
     )
-    control = OCP(
-        20,
-        q=(1.0, 1.0),
-        r=(1.0,),
-        r_delta=(1.0,),
-        u_min=(-2.0,),
-        u_max=(2.0,),
-    )
+    control = OCP(20, q=(1.0, 1.0), r=(1.0,), r_delta=(1.0,), u_min=(-2.0,), u_max=(2.0,))
     scenario = Scenario(
         "axis", "An axis", "", prior=room["Axis"], data=spec, control=control, sensor_sigma=(machine.noise,)
     )

@@ -9,9 +9,8 @@ import pytest
 from hybrid_mpc import ChannelLimit, InputError, WatchLimits, load_scenario
 from hybrid_mpc.kit.parts import WatchFile
 from hybrid_mpc.watch.readings import Channel
-from hybrid_mpc.workflow.stages.report import _watch_tables, _watch_words
+from hybrid_mpc.workflow.stages.report import _watch_tables, _watch_words, rate_words, watching_table
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult, rates
-from hybrid_mpc.workflow.stages.watching import rate_words, watching_table
 
 LIMITS = WatchLimits(
     "residuals",

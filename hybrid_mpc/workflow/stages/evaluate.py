@@ -11,12 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.identify.bands import RunParts, coverage, interval_score
-from hybrid_mpc.identify.evaluate import (
-    FreeRun,
-    Scores,
-    evaluation_trajectories,
-    score,
-)
+from hybrid_mpc.identify.evaluate import FreeRun, Scores, evaluation_trajectories, score
 from hybrid_mpc.kit.prediction import Bands
 from hybrid_mpc.records import beside
 from hybrid_mpc.workflow.context import Context

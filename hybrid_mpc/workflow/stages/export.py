@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-
-import numpy as np
-from numpy.typing import NDArray
 
 import nn_export
 from hybrid_mpc.compare.controllers import noise_of
-from hybrid_mpc.data.scales import robust_spread
+from hybrid_mpc.compare.tracked import spread_of
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.identify.export import check_parity, trace_model
@@ -94,7 +91,7 @@ def export_stage(context: Context) -> ExportResult:
     smoothed = context.smoothed("train")
     deployed = replace(
         info, input_delay=prior.fit.delay, time_unit=context.time_unit,
-        state_spread=_spread([t.x for t in smoothed]), output_spread=_spread([t.y for t in smoothed]),
+        state_spread=spread_of([t.x for t in smoothed]), output_spread=spread_of([t.y for t in smoothed]),
     )  # fmt: skip
     programs: dict[str, dict[str, nn_export.Program]] = {}
     parities = []
@@ -123,14 +120,6 @@ def export_stage(context: Context) -> ExportResult:
         max(p.jacobian_max_abs_error for p in parities),
         programs_sha256,
     )
-
-
-def _spread(recordings: Sequence[NDArray[np.float64]]) -> tuple[float, ...]:
-    """Spread of each column of recordings ``(n, m)``; 0 for a column that varies by rounding only."""
-    found = [
-        (robust_spread(c), float(np.nanmax(np.abs(c), initial=0.0))) for c in np.concatenate(recordings).T
-    ]
-    return tuple(spread if spread > 1e-9 * largest else 0.0 for spread, largest in found)
 
 
 def predicting(context: Context, phy: Prior) -> Predicting | None:

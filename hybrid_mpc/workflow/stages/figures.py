@@ -90,27 +90,17 @@ def _saved(figure: Figure, path: Path) -> Path:
 
 
 def _explain(context: Context) -> Any:
-    """Error after each found term, and the terms over their data."""
     found = context.find(EXPLAIN)
     if isinstance(found, Absent):
         return
     labels, errors = bars_of(found.explanation)
     figure = explain.error_steps(labels, errors, "held-out error, over the outputs' spreads [-]", found.floor)
-    yield (
-        "explain",
-        "explain_steps",
-        figure,
-        "Held-out error of free runs, and its reduction by each found term.",
-    )
+    caption = "Held-out error of free runs, and its reduction by each found term."
+    yield "explain", "explain_steps", figure, caption
     for number, step in enumerate(found.explanation.steps, 1):
         for k, picture in enumerate(step.pictures, 1):
-            name = picture.ordinate.partition(" [")[0]
-            yield (
-                "explain",
-                f"explain_{number}_{k}",
-                explain.term_over_data(picture),
-                f"{name} over its data.",
-            )
+            caption = f"{picture.ordinate.partition(' [')[0]} over its data."
+            yield "explain", f"explain_{number}_{k}", explain.term_over_data(**vars(picture)), caption
 
 
 def _data(context: Context) -> Any:
@@ -217,7 +207,6 @@ def metrics_of(prior: Prior) -> dict[str, str]:
 
 
 def _flat(scores: Scores) -> dict[str, Any]:
-    """Errors by name; None if a run diverged."""
     every = {"error": scores.error, "e_sim": scores.e_sim}
     every |= {f"rmse {label}": value for label, value in scores.rmse.items()}
     every |= {f"violation {label}": value for label, value in scores.violation.items()}
@@ -225,7 +214,6 @@ def _flat(scores: Scores) -> dict[str, Any]:
 
 
 def _band(prior: Prior, arrays: Any, run: str) -> dict[str, tuple[Any, Any]]:
-    """The hybrid's band by the name of an output: lower and upper end."""
     y_hat, half = arrays[f"{run}/y_hat"], arrays[f"{run}/band"]
     return {s.name: (y_hat[:, j] - half[:, j], y_hat[:, j] + half[:, j]) for j, s in enumerate(prior.outputs)}
 
@@ -348,12 +336,8 @@ def _watch(context: Context) -> Any:
         windows = clean_windows(context, whole[name], ("train", "valid", "test", "nominal"))
         notes = [(a.start_s, a.diagnosis) for a in found.alarms if a.file == name and a.diagnosis]
         figure = drawn(name, windows=windows, notes=notes, title=name)
-        yield (
-            "watch",
-            f"monitor_{name.replace('#', '-')}",
-            figure,
-            f"The monitor over the whole recording {name}.",
-        )
+        caption = f"The monitor over the whole recording {name}."
+        yield "watch", f"monitor_{name.replace('#', '-')}", figure, caption
     for row in found.faults or ():
         marks = [(row.start_s, row.title), *((s.t_s, f"guard: {s.after.lower()}") for s in row.switches)]
         seen = "no alarm" if row.delay_s is None else f"alarm after {row.delay_s:.2g} s"

@@ -193,9 +193,14 @@ class TrainingResult:
 
 def check_data(context: Context) -> None:
     """Read and check the user's recordings before the run's folder is made: bad recordings leave no folder behind."""
+    check_source(context)
     if context.settings.data:
         doubts(context)  # reads and checks the recordings
-    elif context.scenario.make_data is None:
+
+
+def check_source(context: Context) -> None:
+    """Refuse a scenario that cannot simulate recordings if the user gives none."""
+    if not context.settings.data and context.scenario.make_data is None:
         raise InputError(
             f"scenario {context.scenario.name}: no recordings. It cannot simulate them; give recordings of the machine "
             f"with --data FILE.csv, once for each file [HM-WORKFLOW-037]"
@@ -402,7 +407,6 @@ def examined_prior(context: Context) -> PriorResult:
 
 
 def _error_of(baseline: BaselineScores) -> float:
-    """Error of a baseline; infinite if the baseline has no errors."""
     return math.inf if baseline.errors is None else baseline.errors.error
 
 

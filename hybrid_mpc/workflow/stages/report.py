@@ -9,17 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scipy.stats import chi2
+
 from hybrid_mpc.compare.controllers import CONTROLLERS
 from hybrid_mpc.compare.loops import DRAWN_PRIOR, ON_MODEL
 from hybrid_mpc.compare.sequential import SAME, hardest
 from hybrid_mpc.compare.step_response import step_responses
 from hybrid_mpc.compare.summary import Summary
 from hybrid_mpc.compare.tasks import tasks_of
+from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.evaluate import OutputErrors
 from hybrid_mpc.identify.settings import NO_BALANCE
 from hybrid_mpc.plots.style import name_of, number
+from hybrid_mpc.records import plain
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
 from hybrid_mpc.rules import counted, two_digits
+from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
@@ -33,17 +38,11 @@ from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult, fi
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import ExportResult
 from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
-from hybrid_mpc.workflow.stages.identify import (
-    DATA,
-    DataResult,
-    models_of,
-    training_settings,
-)
+from hybrid_mpc.workflow.stages.identify import DATA, DataResult, models_of, training_settings
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
-from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect, write_results
+from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect
 from hybrid_mpc.workflow.stages.track import TrackResult
-from hybrid_mpc.workflow.stages.watch import WatchedRecording, WatchResult
-from hybrid_mpc.workflow.stages.watching import watching_table
+from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchedRecording, WatchResult
 
 TITLES: Mapping[str, str] = {
     "promises": "What this kit promises",
@@ -61,6 +60,10 @@ TITLES: Mapping[str, str] = {
     "analysis": "Linear analysis",
     "glossary": "Names and definitions",
 }
+CHANNEL_CAPTION = (
+    "Channels of the monitor. A false alarm begins while no fault or disturbance acts; their interval is that of a "
+    "Poisson count. Each simulated fault stands beside the channel that alarms first."
+)
 FADED = "Training penalized the network's correction far away from all recordings"
 
 
@@ -77,7 +80,7 @@ def report_stage(context: Context) -> ReportResult:
     results = collect(context)
     figures = draw_all(context)
     write_report(context.out / "report.html", _report(context, results, figures))
-    write_results(context.out / "results.json", results)
+    write_json(context.out / "results.json", plain(results))
     drawn = tuple(path.name for group in figures.values() for path, _ in group)
     return ReportResult("report.html", drawn)
 
@@ -329,7 +332,6 @@ def _data_table(data: DataResult) -> Table:
 
 
 def _explained(context: Context) -> bool:
-    """Whether missing terms were searched."""
     found = context.find(EXPLAIN)
     return not isinstance(found, Absent)
 
@@ -434,7 +436,6 @@ def _band_table(context: Context, found: EvaluationResult) -> Table:
 
 
 def _by(values: Mapping[str, float], label: str) -> float | None:
-    """The finite number of a signal, or None."""
     return finite(values.get(label, math.nan))
 
 
@@ -579,7 +580,6 @@ def _observer_table(found: EstimationResult) -> Table:
 
 
 def _varying_table(found: TrackResult) -> Table:
-    """Parameters by their variation between recordings."""
     tracked = {one.name: one for one in found.tracking.tracked}
     rows = [
         (f"{p.name} [{p.unit}]", p.value, p.std or "fixed", p.gain,
@@ -609,7 +609,6 @@ def _timing_table(ms: StepTimes) -> Table:
 
 
 def _watch_tables(found: WatchResult) -> list[Table]:
-    """Tables of the channels, of the loops with a fault, and of the alarms on recordings."""
     if found.limits is None:
         return []
     tables = [watching_table(found, found.limits)]
@@ -628,6 +627,63 @@ def _watch_tables(found: WatchResult) -> list[Table]:
     alarms = [(a.file, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for a in found.alarms]
     heads = ("recording", "from [s]", "to [s]", "channels", "diagnosis")
     return [*tables, Table(heads, alarms, "Alarms over the whole recordings.")]
+
+
+def watching_table(found: WatchResult, limits: WatchLimits) -> Table:
+    """Table of the channels with limits, of the frozen-sensor checks, and of all together."""
+    rows, faults = [], found.faults or ()
+    for channel in found.channels:
+        own = limits.of(channel.name)
+        if own:
+            threshold = "; ".join(limit.words(limits.dt) for limit in own)
+            rows.append(_channel_row(channel.name, threshold, found.by_channel, faults))
+    frozen = [name for name in found.by_channel if name.endswith(" frozen")]
+    for name, far, often in zip(frozen, limits.travel, limits.repeats, strict=True):
+        rows.append(_channel_row(name, f"travel {far:.3g}, {often} repeats", found.by_channel, faults))
+    clean = found.clean or CleanAlarms()
+    never = [row for row in faults if row.delay_s is None]
+    rows.append(("all together", "", rate_words(clean.alarms, clean.seconds), *_delays_of(never)))
+    heads = (
+        "channel",
+        "threshold",
+        "false alarms an hour (95 % interval)",
+        "detection delay of faults",
+        "diagnosis",
+    )
+    return Table(heads, rows, CHANNEL_CAPTION)
+
+
+def rate_words(alarms: int, seconds: float) -> str:
+    """Alarms an hour with their 95 % interval.
+
+    Source: exact interval of a Poisson count (Garwood, 1936).
+
+    Example:
+        >>> rate_words(1, 300.0), rate_words(0, 76.0), rate_words(0, 0.0)
+        ('12 (0.3 to 67)', '0 (0 to 170)', 'not watched')
+    """
+    if not seconds > 0:
+        return "not watched"
+    hours = seconds / 3600.0
+    low = 0.5 * float(chi2.ppf(0.025, 2 * alarms)) / hours if alarms else 0.0
+    high = 0.5 * float(chi2.ppf(0.975, 2 * alarms + 2)) / hours
+    rate, least, most = map(two_digits, (alarms / hours, low, high))
+    return f"{rate} ({least} to {most})"
+
+
+def _channel_row(
+    name: str, threshold: str, by_channel: Mapping[str, CleanAlarms], faults: Sequence[FaultedLoop]
+) -> tuple[str, str, str, str, str]:
+    own = by_channel.get(name, CleanAlarms())
+    seen = [row for row in faults if row.channels[:1] == (name,)]
+    return (name, threshold, rate_words(own.alarms, own.seconds), *_delays_of(seen))
+
+
+def _delays_of(faults: Sequence[FaultedLoop]) -> tuple[str, str]:
+    """Detection delays and diagnoses of faults, as text."""
+    after = [f"{row.fault} {'never' if row.delay_s is None else f'{row.delay_s:.2g} s'}" for row in faults]
+    causes = [f"{row.fault}: {row.diagnosis or 'none'}" for row in faults if row.delay_s is not None]
+    return "; ".join(after), "; ".join(causes)
 
 
 def _pole_table(analysis: AnalysisResult) -> Table:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_object, write_json
-from hybrid_mpc.records import plain, record
+from hybrid_mpc.files import read_object
+from hybrid_mpc.records import record
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explained import ExplainResult
 from hybrid_mpc.workflow.stage import Absent, Stage
@@ -20,14 +20,7 @@ from hybrid_mpc.workflow.stages.estimate import ESTIMATION, EstimationResult
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, ExportResult, NoiseResult
-from hybrid_mpc.workflow.stages.identify import (
-    DATA,
-    PRIOR,
-    TRAINING,
-    DataResult,
-    PriorResult,
-    TrainingResult,
-)
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, DataResult, PriorResult, TrainingResult
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, OnModelResult
 from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult
 from hybrid_mpc.workflow.stages.track import TRACK, TrackResult
@@ -98,11 +91,6 @@ def collect(context: Context) -> Results:
     return Results(
         SCHEMA_VERSION, context.scenario.name, settings.seed, settings.budget, context.versions, **found
     )
-
-
-def write_results(path: Path, results: Results) -> None:
-    """Write ``results.json``; the stages' arrays stay in ``checkpoints/``."""
-    write_json(path, plain(results))
 
 
 def read_results(path: Path) -> Results:
