@@ -114,7 +114,7 @@ def true_motion(tests: Sequence[Trajectory], seed: int) -> list[Trajectory]:
 
 
 def figures(prior: Prior, tests: Sequence[Trajectory], states: Sequence[np.ndarray], warm: int) -> np.ndarray:
-    """Mean ``E_sim`` [s], RMS of the angle [rad] and energy violation [W] of runs with these ``states`` ``(n, 2)`` each."""
+    """Mean ``E_sim`` [s], RMS of the angle [rad] and energy violation [W] of runs: ``states`` ``(n, 2)`` each."""
     rows = []
     for t, x_hat in zip(tests, states, strict=True):
         x, u = t.x[warm:], t.u[warm : warm + len(x_hat) - 1]
