@@ -457,15 +457,17 @@ def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int
 def deviations(
     signals: Sequence[Signal], held: Sequence[int], sigma: Array, errors: Array
 ) -> tuple[Deviation, ...]:
-    """Deviations over the end of a loop, from errors ``(n, n_y)`` of the outputs; NaN are lost samples."""
+    """Deviations over the end of a loop, from errors ``(n, n_y)`` of the outputs; NaN are lost samples, and the result is
+    NaN if all of them are lost, as after a failure.
+    """
     late = errors[int((1.0 - END) * len(errors)) :]
-    with np.errstate(over="ignore", invalid="ignore"):
-        return tuple(
-            Deviation(
-                signals[i], float(sigma[i]), float(np.nanmean(late[:, i])), float(np.nanstd(late[:, i]))
-            )
-            for i in held
-        )
+    found = []
+    for i in held:
+        known = late[~np.isnan(late[:, i]), i]
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean, std = (float(known.mean()), float(known.std())) if len(known) else (math.nan, math.nan)
+        found.append(Deviation(signals[i], float(sigma[i]), mean, std))
+    return tuple(found)
 
 
 def _find_settled(errors: Array, sigma: Array, horizon: int) -> int | None:

@@ -383,3 +383,8 @@ def test_a_run_leaves_its_table_in_the_model_s_folder_on_the_page_and_on_the_ter
     for row in rows:
         assert page.index(f"<td>{row.name}</td>") > table
         assert f"  {row.verdict:12}  {row.name}:" in told.replace("\n", " ").replace("  ", "  ")
+
+
+def test_a_loop_that_lost_all_samples_keeps_nothing():
+    lost = p.deviations((Signal("y", "m"),), (0,), np.array([0.1]), np.full((20, 1), np.nan))
+    assert not lost[0].kept
