@@ -457,8 +457,8 @@ def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int
 def deviations(
     signals: Sequence[Signal], held: Sequence[int], sigma: Array, errors: Array
 ) -> tuple[Deviation, ...]:
-    """Deviations over the end of a loop, from errors ``(n, n_y)`` of the outputs; NaN are lost samples, and the result is
-    NaN if all of them are lost, as after a failure.
+    """Deviations over the end of a loop, from errors ``(n, n_y)`` of the outputs; NaN are lost samples. NaN if all of
+    them are lost, as after a failure.
     """
     late = errors[int((1.0 - END) * len(errors)) :]
     found = []
