@@ -4,9 +4,9 @@
 
 A pace is ``quiet/slip``: the random walk of every load per period in the quiet and in the slip filter, as shares of the
 load's size. Everything else is that of the default observer, the process noise, too. ``--steps three`` is the default
-observer without its filter of outliers. ``--outliers 0.01`` puts samples off by 5 to 50 standard deviations in that
-share of the outputs' samples. The ratios are paired by seeds: geometric means with 95 % intervals over the default's
-loops.
+observer without its filter of outliers, ``--steps small`` that with jumps of 5 % of every load's size. ``--outliers
+0.01`` puts samples off by 5 to 50 standard deviations in that share of the outputs' samples. The ratios are paired by
+seeds: geometric means with 95 % intervals over the default's loops.
 """
 
 from __future__ import annotations
@@ -29,24 +29,23 @@ from unknown_loops import interval, prepared
 from hybrid_mpc import Estimate, ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, with_outliers
-from hybrid_mpc.kit.assembly import FIRST_LOAD, first_deviations, make_controller
+from hybrid_mpc.kit.assembly import FIRST_LOAD, JUMP, first_deviations, make_controller
 from hybrid_mpc.loop.loop import Loop
 
-JUMP = 0.05
-"""Share of the load's size in the jump filter, as in the default observer."""
+
+def filter_of(own: Made, scale: float, share: float, sensor: float = 1.0) -> ExtendedKalmanFilter:
+    """A filter of the default observer with another random walk of the loads."""
+    model, size = own.model, disturbance_sizes(own.model, own.control)
+    return ExtendedKalmanFilter(
+        model, sigma_y=sensor * own.sigma, sigma_x=scale * own.noise[0],
+        sigma_x0=first_deviations(model, own.scenario), sigma_d=share * size, sigma_d0=FIRST_LOAD * size,
+    )  # fmt: skip
 
 
 def observer_of(own: Made, quiet: float, slip: float) -> Filter:
     """The default observer with other random walks of the loads."""
-    model, size = own.model, disturbance_sizes(own.model, own.control)
-
-    def filter_of(scale: float, share: float, sensor: float = 1.0) -> ExtendedKalmanFilter:
-        return ExtendedKalmanFilter(
-            model, sigma_y=sensor * own.sigma, sigma_x=scale * own.noise[0],
-            sigma_x0=first_deviations(model, own.scenario), sigma_d=share * size, sigma_d0=FIRST_LOAD * size,
-        )  # fmt: skip
-
-    modes = filter_of(1.0, quiet), filter_of(SLIP, slip), filter_of(1.0, JUMP), filter_of(1.0, quiet, OUTLIER)
+    shares = (1.0, quiet), (SLIP, slip), (1.0, JUMP), (1.0, quiet, OUTLIER)
+    modes = [filter_of(own, *share) for share in shares]
     return SwitchingFilter(modes, with_outliers(SWITCHES))
 
 
@@ -82,6 +81,10 @@ def compared(
     for one in steps:
         if one == "three":
             observers[one] = SwitchingFilter(default.filters[:3], SWITCHES)
+        elif one == "small":
+            quiet, slip, _, outlier = default.filters
+            jump = filter_of(own, 1.0, JUMP)
+            observers[one] = SwitchingFilter([quiet, slip, jump, outlier], with_outliers(SWITCHES))
         else:
             observers[one] = observer_of(own, *(float(v) for v in one.split("/")))
     base, rows = list[Ran](), []

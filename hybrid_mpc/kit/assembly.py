@@ -17,11 +17,12 @@ from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimator, ExtendedKalmanFilter
-from hybrid_mpc.estimate.offset_free import distinguishable, offset_free
+from hybrid_mpc.estimate.offset_free import distinguishable, offset_free, steady_matrices
 from hybrid_mpc.estimate.parameters import parameter_filter, with_parameter_states
 from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, SwitchingFilter, with_outliers
 from hybrid_mpc.estimate.tuning import FOUND, choose_most_likely, remaining_load
 from hybrid_mpc.loop.guard import Guard, Mode
+from hybrid_mpc.model.equilibrium import hidden_fixed_point
 from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 from hybrid_mpc.records import known
 from nn_export.errors import CompileError
@@ -46,6 +47,9 @@ friction, and intermittent model errors are taken for loads. With four horizons 
 SEARCHED = 100
 """Horizons after which a load that no filter has estimated counts as never estimated: its offset would last for minutes
 with a plan of seconds."""
+JUMP = 0.05
+"""Standard deviation of a jump of the load per period in the jump filter, as a share of the load's size: a load of 5 %
+is ordinary, a larger one takes a few periods. It is larger if slips would explain it, see :func:`jump_shares`."""
 FIRST_LOAD = 0.001
 """Initial standard deviation of the load, as a share of the input's range. It is small, because the load of a machine
 that sticks at rest is not observable, and its estimate would be wrong when the machine moves."""
@@ -268,10 +272,9 @@ def make_estimator(
         return filter_of(1.0, quiet, make)
     slip = quiet_shares(partial(filter_of, SLIP), periods, model.n_d)
     # else the slip filter would explain a lasting load by repeated slips, and never estimate it
-    # jump: a load of 5 % of the drive's range is ordinary, a larger one takes a few periods
     modes = (
-        filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)), filter_of(1.0, np.full(model.n_d, 0.05)),
-        filter_of(1.0, quiet, sensor=OUTLIER),
+        filter_of(1.0, quiet), filter_of(SLIP, np.maximum(quiet, slip)),
+        filter_of(1.0, jump_shares(model, sigma_x, span)), filter_of(1.0, quiet, sensor=OUTLIER),
     )  # fmt: skip
     _check_found(modes[:3], SEARCHED * control.horizon, Sizes(model, control).states)
     return SwitchingFilter(modes, with_outliers(SWITCHES))
@@ -315,6 +318,21 @@ def quiet_shares(filter_of: Callable[[Array], ExtendedKalmanFilter], periods: in
             break
         shares = np.where(slow, 2.0 * shares, shares)
     return shares
+
+
+def jump_shares(model: HybridModel, sigma_x: Array, span: Array) -> Array:
+    """Random walk ``(n_d,)`` of the loads per period in the jump filter, as shares of their sizes ``span``.
+
+    Each is at least :data:`JUMP`, and at most one. In between it moves a state in a period by twice the noise of the
+    slip filter, where it is most visible. With less, the slip filter would be more probable however large the load is,
+    and would explain it by one slip after the other. A disturbance that moves no state within a period has
+    :data:`JUMP`.
+    """
+    h = hidden_fixed_point(model, model.x0, model.u0)
+    b_d = steady_matrices(model, model.x0, h, model.u0, model.w)[0][: model.n_x, model.n_x + model.n_h :]
+    slips = 2.0 * SLIP * np.maximum(sigma_x, 1e-300)
+    seen = np.max(np.abs(b_d) * span / slips[:, None], axis=0)
+    return np.where(seen > 0, np.clip(1.0 / np.maximum(seen, 1e-300), JUMP, 1.0), JUMP)
 
 
 def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:

@@ -390,7 +390,7 @@ def test_the_command_tells_it_before_it_reads_anything(call, tmp_path):
     )
     code, _, message = call("run", machine, "--data", tmp_path / "none.csv", "--out", tmp_path / "out")
     assert code == 2
-    assert "horizon: must be an integer from 1 to 10000 periods, got 0" in message
+    assert "horizon [periods]: must be an integer from 1 to 10000, got 0" in message
     assert "machine.py:3" in message
     assert not (tmp_path / "out").exists()
 
