@@ -39,7 +39,7 @@ def test_a_load_that_a_slip_could_explain_is_found_within_eight_periods():
 
 
 def test_with_small_jumps_slips_explain_it():
-    quiet, slip, jump, outlier = make_estimator(TANK, SCENARIO, SIGMA_X).filters
+    quiet, slip, _, outlier = make_estimator(TANK, SCENARIO, SIGMA_X).filters
     small = ExtendedKalmanFilter(
         TANK, sigma_y=[0.01], sigma_x=SIGMA_X, sigma_x0=[0.01], sigma_d=[JUMP], sigma_d0=[0.001]
     )
