@@ -1,5 +1,6 @@
 """A load that comes at once is estimated within a few periods, however large the process noise is."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -52,9 +53,18 @@ def test_the_jump_exceeds_a_slip_twice_and_stays_between_its_limits(sigma, share
     assert jump_shares(TANK, np.array([sigma]), np.ones(1)) == pytest.approx(share)
 
 
-def test_a_disturbance_of_an_output_keeps_the_default():
-    biased = HybridModel.of(
-        "biased", 1.0, TANK.states, TANK.inputs, TANK.outputs, x=X, u=U, y=X, x_next=0.9 * X + 0.1 * U, xdot=U - X,
-        disturbance_model=(Disturbance("output", "level", 1.0),),
-    )  # fmt: skip
-    assert jump_shares(biased, SIGMA_X, np.ones(1)) == pytest.approx(JUMP)
+@pytest.mark.parametrize(
+    ("disturbance", "sigma", "share"),
+    [
+        (Disturbance("output", "level", 1.0), 0.05, JUMP),
+        (
+            Disturbance("input", "pump"),
+            0.004,
+            0.8,
+        ),  # the whole range moves the level by 0.1, 20 * 0.004 is less
+        (Disturbance("input", "pump"), 0.05, JUMP),  # more
+    ],
+)
+def test_what_no_jump_shows_keeps_the_default(disturbance, sigma, share):
+    model = replace(TANK, disturbance_model=(disturbance,))
+    assert jump_shares(model, np.array([sigma]), np.ones(1)) == pytest.approx(share)

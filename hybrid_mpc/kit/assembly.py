@@ -326,13 +326,14 @@ def jump_shares(model: HybridModel, sigma_x: Array, span: Array) -> Array:
     Each is at least :data:`JUMP`, and at most one. In between it moves a state in a period by twice the noise of the
     slip filter, where it is most visible. With less, the slip filter would be more probable however large the load is,
     and would explain it by one slip after the other. A disturbance that moves no state within a period has
-    :data:`JUMP`.
+    :data:`JUMP`, and so has an input whose whole range moves a state less: a jump there is no clearer than a slip.
     """
     h = hidden_fixed_point(model, model.x0, model.u0)
     b_d = steady_matrices(model, model.x0, h, model.u0, model.w)[0][: model.n_x, model.n_x + model.n_h :]
     slips = 2.0 * SLIP * np.maximum(sigma_x, 1e-300)
     seen = np.max(np.abs(b_d) * span / slips[:, None], axis=0)
-    return np.where(seen > 0, np.clip(1.0 / np.maximum(seen, 1e-300), JUMP, 1.0), JUMP)
+    shown = (seen >= 1.0) | ((seen > 0) & ~np.any(model.disturbed[0] != 0, axis=0))
+    return np.where(shown, np.clip(1.0 / np.maximum(seen, 1e-300), JUMP, 1.0), JUMP)
 
 
 def first_deviations(model: HybridModel, scenario: LoopAssumptions) -> Array:

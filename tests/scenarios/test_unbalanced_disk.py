@@ -169,4 +169,4 @@ def test_the_fallback_knows_what_is_under_way(models):
         assert result.source.count("FALLBACK") > 40
         ends[name] = np.abs(result.x[:, 0] - np.pi).max()
     assert ends["late"] < 0.15  # friction makes it sway
-    assert ends["at once"] > 0.5  # it falls
+    assert ends["at once"] > 3 * ends["late"]  # it falls
