@@ -486,9 +486,7 @@ def _find_settled(errors: Array, sigma: Array, horizon: int) -> int | None:
 
 def _explain_failure(point: SetPoint, result: ClosedLoopResult) -> str:
     """Which state leaves its declared range by far, and when, with the first failed solve; empty if none does."""
-    model = point.model
-    with np.errstate(invalid="ignore", over="ignore"):
-        within = np.abs(result.x - point.rest[0]) <= LEAVES * _compute_ranges(model)
+    model, within = point.model, _is_near(point, result)
     if within.all():
         return ""
     k, i = (int(own[0]) for own in np.nonzero(~within))
@@ -502,6 +500,12 @@ def _explain_failure(point: SetPoint, result: ClosedLoopResult) -> str:
         return f"{text}; no solve failed"
     share = f"{failed.size} of {len(result.source)} failed"
     return f"{text}; first failed solve after {failed[0] * model.dt:.3g} s ({share})"
+
+
+def _is_near(point: SetPoint, result: ClosedLoopResult) -> NDArray[np.bool_]:
+    """Whether each state is near its declared range ``(n, n_x)``."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.asarray(np.abs(result.x - point.rest[0]) <= LEAVES * _compute_ranges(point.model))
 
 
 def failing_loop(points: Sequence[SetPoint], every: Sequence[Sequence[Trial]]) -> Promise | None:
@@ -528,12 +532,13 @@ def _choose_failure_remedy(point: SetPoint, failing: Trial) -> str:
     """Remedy for a loop that fails, by its solves and the growth of small errors at the set-point."""
     solved, problem = failing.solved, point.problem
     first = len(solved) if solved.all() else int(np.argmin(solved))
+    ran_away = not _is_near(point, failing.result)[:first].all()  # although every solve until then succeeded
     before, edge = failing.result.u[max(0, first - BEFORE) : first], AT_LIMIT * problem.input_range
     at = (before >= problem.u_max - edge) | (before <= problem.u_min + edge)
-    if solved.all() or (at.size and at.mean(axis=0).max() > 0.5):
+    if ran_away or solved.all() or (at.size and at.mean(axis=0).max() > 0.5):
         return (
-            "The controller's input does not hold the machine against these loads: choose set-points farther from the "
-            "limits of the inputs, a stronger actuator, or a better prior."
+            "The controller's input does not hold the machine against these loads and errors: use set-points farther "
+            "from the limits of the inputs, a stronger actuator, a shorter period, or a better prior."
         )
     finite = "write a prior that is finite beyond the ranges of its states (docs/unstable.md)"
     tenfold = _compute_growth(point)
