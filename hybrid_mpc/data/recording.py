@@ -42,6 +42,7 @@ ALIKE = 0.8  # least similarity of two recording names that differ by a typo
 FEWEST = 10  # fewest time stamps that show whether the sampling is uniform
 UNEVEN = 1e-3  # relative deviation above which two steps differ
 COARSE = 1.5  # largest sampling period in model periods: beyond it, interpolation would invent samples
+NOISE_SHARE = 0.01  # share of a signal's range that a sample may be beyond it: the noise of a sensor at its end
 ROUNDING = 1e-9  # relative distance from an end of a sensor's range within which a sample is at that end
 TIME = Signal("time", "s")
 
@@ -404,7 +405,9 @@ def _range_problems(channel: Channel, columns: Columns, note: str) -> list[str]:
     """Problems with implausible values."""
     signal, column = channel.signal, channel.y
     lower, upper = max(signal.lower, -ABSURD), min(signal.upper, ABSURD)
-    bad = np.flatnonzero((column < lower) | (column > upper))  # NaN is already reported elsewhere
+    # noise carries a value at an end of its range beyond it; NaN is already reported elsewhere
+    noise = NOISE_SHARE * (signal.upper - signal.lower) if math.isfinite(signal.upper - signal.lower) else 0.0
+    bad = np.flatnonzero((column < lower - noise) | (column > upper + noise))
     if not len(bad):
         return []
     first, worst = int(bad[0]), int(bad[np.argmax(np.abs(column[bad]))])

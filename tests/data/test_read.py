@@ -70,6 +70,7 @@ def test_the_numbers_are_those_that_were_written(tmp_path, kind):
         ("time_s", np.nan, "column 'time_s' is '?nan'?, not a finite number"),
         ("phi", -np.inf, "column 'phi' is '?-inf"),
         ("tau", np.inf, "column 'tau' is '?inf"),
+        ("phi", 10.21, r"column 'phi': 10\.21 is outside the plausible range -10 to 10 rad of phi\. Check"),
         ("phi", 11.0, r"column 'phi': 11 is outside the plausible range -10 to 10 rad of phi\. Check"),
         ("phi", 90.0, r"column 'phi': 90 is outside .*rad of phi\. Check"),  # one row is no wrong unit
         ("phi", 1e307, r"column 'phi': 1e\+307 is outside the plausible range -10 to 10 rad of phi\. Check"),
@@ -82,6 +83,11 @@ def test_a_bad_number_is_named_as_the_files_own_tools_count(tmp_path, kind, name
     columns[name][11] = value
     word, first = FIRST[kind]
     refused(wrote(tmp_path, kind, columns), rf"{word} {11 + first}, {match}")
+
+
+def test_noise_at_the_end_of_a_range_is_plausible(tmp_path, kind):
+    phi = np.where(np.arange(60) == 11, 10.19, GOOD["phi"])  # within 1 % of the range of 20 rad
+    assert read_recording(wrote(tmp_path, kind, {**GOOD, "phi": phi}), SIGNALS, SPEC).y[11, 0] == 10.19
 
 
 def test_bad_columns(tmp_path, kind):
