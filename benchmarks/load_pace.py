@@ -3,10 +3,14 @@
     python benchmarks/load_pace.py --names ball_and_beam --steps 0.0006/0.005 0.0008/0.0065 --seeds 10
 
 A pace is ``quiet/slip``: the random walk of every load per period in the quiet and in the slip filter, as shares of the
-load's size. Everything else is that of the default observer, the process noise, too. ``--steps three`` is the default
-observer without its filter of outliers, ``--steps small`` that with jumps of 5 % of every load's size. ``--outliers
-0.01`` puts samples off by 5 to 50 standard deviations in that share of the outputs' samples. The ratios are paired by
-seeds: geometric means with 95 % intervals over the default's loops.
+load's size. Everything else is that of the default observer, the process noise, too. Other ``--steps``:
+
+- ``three``: the default observer without its filter of outliers;
+- ``small``: the default observer with jumps of 5 % of every load's size;
+- ``rates``: a disturbance at the rate of the state that each output measures.
+
+``--outliers 0.01`` puts samples off by 5 to 50 standard deviations in that share of the outputs' samples. The ratios
+are paired by seeds: geometric means with 95 % intervals over the default's loops.
 """
 
 from __future__ import annotations
@@ -23,13 +27,14 @@ import numpy as np
 from unknown.loops import Made, Own, Ran, Trial, ran, trials_of
 from unknown.motion import MOTION
 from unknown.plants import Plant
-from unknown.processes import PROCESSES
+from unknown.processes import PROCESSES, WHOLE
 from unknown_loops import interval, prepared
 
 from hybrid_mpc import Estimate, ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, with_outliers
 from hybrid_mpc.kit.assembly import FIRST_LOAD, JUMP, first_deviations, make_controller
+from hybrid_mpc.kit.disturbances import rates_of_outputs
 from hybrid_mpc.loop.loop import Loop
 
 
@@ -71,15 +76,22 @@ def moved(own: Made, loop: Ran) -> float:
 
 
 def compared(
-    name: str, plant: Plant, own: Made, trials: list[Trial], steps: list[str], share: float
+    name: str,
+    plant: Plant,
+    own: Made,
+    other: Made | None,
+    trials: list[Trial],
+    steps: list[str],
+    share: float,
 ) -> list[str]:
-    """Rows of the table: the default observer, then each pace."""
-    controller = make_controller(own.model, own.model, own.control, solver="native")
+    """Rows of the table: the default observer, then each pace; ``other`` has the disturbances at rates."""
     default = own.parts[0]
     assert isinstance(default, SwitchingFilter)
     observers: dict[str, Filter] = {"default": default}
     for one in steps:
-        if one == "three":
+        if one == "rates" and other is not None:
+            observers[one] = other.parts[0]
+        elif one == "three":
             observers[one] = SwitchingFilter(default.filters[:3], SWITCHES)
         elif one == "small":
             quiet, slip, _, outlier = default.filters
@@ -89,6 +101,7 @@ def compared(
             observers[one] = observer_of(own, *(float(v) for v in one.split("/")))
     base, rows = list[Ran](), []
     for step, observer in observers.items():
+        controller = make_controller(observer.model, observer.model, own.control, solver="native")
         spoiled = [Spoiled(observer, own.sigma, share, i) if share else observer for i in range(len(trials))]
         loops = [
             ran(plant, own, trial, Own(Loop(each, controller), own.held))
@@ -111,18 +124,21 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--names", nargs="+", required=True, help="machines")
-    parser.add_argument("--steps", nargs="+", required=True, help="paces, quiet/slip; three")
+    parser.add_argument("--steps", nargs="+", required=True, help="paces, quiet/slip; three, small, rates")
     parser.add_argument("--seeds", type=int, default=10, help="paired loops of each machine")
     parser.add_argument("--outliers", type=float, default=0.0, help="share of outliers in the samples")
     given = parser.parse_args()
     print("| machine | quiet/slip | settled | cost over the default's | largest | moves |\n|" + " --- |" * 6)
     with tempfile.TemporaryDirectory() as folder:
-        for machine in (*PROCESSES, *MOTION):
+        for machine in (*PROCESSES, *MOTION, *WHOLE):
             if machine.name in given.names:
                 plant, own = prepared(machine, Path(folder))
+                other = (
+                    prepared(machine, Path(folder), rates_of_outputs)[1] if "rates" in given.steps else None
+                )
                 trials = trials_of(machine.name, plant, own, 0, given.seeds)
                 print(
-                    *compared(machine.name, plant, own, trials, given.steps, given.outliers),
+                    *compared(machine.name, plant, own, other, trials, given.steps, given.outliers),
                     sep="\n",
                     flush=True,
                 )

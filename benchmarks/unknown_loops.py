@@ -38,15 +38,19 @@ from scipy.stats import t as student
 from unknown.case_plants import case_plants
 from unknown.cases import Case, cases
 from unknown.common import Machine, report
-from unknown.loops import Made, Ran, made, ran, trials_of, tuned_rival
+from unknown.loops import Choice, Made, Ran, made, ran, trials_of, tuned_rival
 from unknown.motion import MOTION
 from unknown.plants import PLANTS, Plant
-from unknown.processes import PROCESSES
+from unknown.processes import PROCESSES, WHOLE
 from unknown_machines import read
 
 from hybrid_mpc import InputError
+from hybrid_mpc.kit.disturbances import default_disturbances
 
-HELD = {"flexible_shaft": ("load",), "magnetic_levitation": ("gap",), "inverted_pendulum": ("s",)}
+HELD = {
+    "flexible_shaft": ("load",), "magnetic_levitation": ("gap",), "inverted_pendulum": ("s",),
+    "quadruple_tank_levels": ("h1", "h2"), "building_walls": ("T_i",),
+}  # fmt: skip
 """Controlled outputs where a machine has more outputs than inputs."""
 BOUND = 1.05
 """Largest upper bound of a ratio that is good."""
@@ -54,14 +58,17 @@ IN_VIEW = (*(m.name for m in PROCESSES[:3]), *(m.name for m in MOTION[:3]))
 """Machines by which the tool was mended; the others were run once, at the end."""
 
 
-def prepared(machine: Machine, folder: Path) -> tuple[Plant, Made]:
-    """The plant of a machine, and what a new user gets of its recordings."""
+def prepared(
+    machine: Machine, folder: Path, disturbances: Choice = default_disturbances
+) -> tuple[Plant, Made]:
+    """The plant of a machine, and what a new user gets of its recordings, with other ``disturbances`` if wanted."""
     parts = read(machine.write(folder / machine.name), machine.prior, machine.spec)
     names = [signal.name for signal in machine.prior.outputs]
     held = [names.index(one) for one in HELD.get(machine.name, names)]
     plant = PLANTS[machine.name]
     sigma = np.hypot(plant.sigma, np.array(plant.step) / np.sqrt(12)).tolist()
-    own = made(machine.name, machine.prior, machine.spec, parts[0], parts[1], machine.length, sigma, held)
+    own = made(machine.name, machine.prior, machine.spec, parts[0], parts[1], machine.length, sigma, held,
+               choice=disturbances)  # fmt: skip
     return plant, own
 
 
@@ -141,7 +148,7 @@ def main() -> None:
     given = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for machine in (*PROCESSES, *MOTION):
+        for machine in (*PROCESSES, *MOTION, *(m for m in WHOLE if m.name in given.names)):
             wanted = given.only == "all" or (machine.name in IN_VIEW) == (given.only == "in-view")
             if (given.names and machine.name not in given.names) or not wanted:
                 continue

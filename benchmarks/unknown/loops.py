@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from hybrid_mpc import OCP, DataSpec, HybridModel, Prior, Scenario, Trajectory, fit_prior
+from hybrid_mpc import OCP, DataSpec, Disturbance, HybridModel, Prior, Scenario, Trajectory, fit_prior
 from hybrid_mpc.check.first_model import CLOSED, Runs, feedback_of, first_lag, growth_of, slowest
 from hybrid_mpc.check.new import HORIZONS, first_limits
 from hybrid_mpc.control.safeguard import SafeController
@@ -31,6 +31,7 @@ from unknown.common import Array, quantised
 from unknown.plants import Plant
 from unknown.rivals import FILTERS, INTEGRAL, TIGHT, Point, Regulator, Rival, Simc, simc_models
 
+Choice = Callable[[HybridModel, OCP], "tuple[Disturbance, ...] | None"]
 OFF, LOAD = (0.2, 0.1, 0.05), 0.2
 """Share by which each parameter of a plant is off, the next one only where no draw of the one before can hold its
 set-points; share of the room to an input's limit that the load at it takes."""
@@ -143,10 +144,12 @@ def first_problem(prior: Prior, train: Sequence[Trajectory], dt: float, held: Se
 def made(
     name: str, make: type[Prior], spec: DataSpec, train: Sequence[Trajectory], valid: Sequence[Trajectory],
     length: float, sigma: Sequence[float], held: Sequence[int], control: OCP | None = None,
+    choice: Choice = default_disturbances,
 ) -> Made:  # fmt: skip
     """Fit the prior, and make what a run makes of it: model, control problem, process noise.
 
-    ``control`` is the control problem. Default: the one that is proposed for the recordings.
+    ``control`` is the control problem. Default: the one that is proposed for the recordings. ``choice`` gives the
+    disturbance model of the fitted prior in it.
     """
     fit = fit_prior(make, train, valid, dt=spec.dt, length=length)
     phy, known = make(fit.values), smoothed(make, fit, train, spec.dt)
@@ -163,7 +166,7 @@ def made(
         name, name, "", prior=make, data=spec, control=control,
         sensor_sigma=tuple(sigma),
     )  # fmt: skip
-    model = replace(model, disturbance_model=default_disturbances(model, control))
+    model = replace(model, disturbance_model=choice(model, control))
     errors = process_noise(model, known)
     noise = tuple(tuned_noise(model, scenario, errors, known, observer=own) for own in (True, False))
     y = np.concatenate([t.y for t in train])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -235,7 +235,7 @@ def chosen(*places: int) -> Callable[[Array], Array]:
     return lambda x: x[list(places)]
 
 
-PLANTS: Mapping[str, Plant] = {
+_MACHINES = {
     "heat_exchanger_2": Plant(
         exchanger_rates, chosen(CELLS - 1, -1),
         {"UA": 7.5, "power": 0.6, "V_h": 1.1, "C_w": 0.3, "V_c": 1.8, "loss": 0.01},
@@ -296,4 +296,12 @@ PLANTS: Mapping[str, Plant] = {
         (0.0, 0.0, 0.0, 0.0), (5e-5,), (1e-4,), 5e-4,
     ),
 }  # fmt: skip
+
+PLANTS: Mapping[str, Plant] = {
+    **_MACHINES,
+    "quadruple_tank_levels": replace(
+        _MACHINES["quadruple_tank"], measure=first(4), sigma=(1e-3,) * 4, step=(5e-4,) * 4
+    ),
+    "building_walls": replace(_MACHINES["building"], measure=first(2), sigma=(0.05,) * 2, step=(0.0625,) * 2),
+}
 """By the machine's name."""

@@ -7,6 +7,9 @@ continuous-time models for the heat dynamics of a building* (1995).
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import casadi as ca
 import numpy as np
 
@@ -84,15 +87,21 @@ class QuadrupleTank(Prior):
         )
 
 
-def quadruple_tank(seed: int) -> Array:
+def quadruple_tank(seed: int, name: str = "quadruple_tank") -> Array:
     """Outlets that differ, an exponent below a half, pumps that need a voltage before they pump."""
     rng = np.random.default_rng([seed, 2])
-    n, dt, plant = 1200, 2.0, PLANTS["quadruple_tank"]
+    n, dt, plant = 1200, 2.0, PLANTS[name]
     volts = np.stack([levels(rng, n, 2, 6, 30, 120), levels(rng, n, 2, 6, 30, 120)], 1)
 
     t, u, y = run(plant, lambda k, y: volts[k], dt, n, 4)
     y = drop_outs(quantised(y + 1e-3 * rng.standard_normal(y.shape), 5e-4), rng, 0.03, 10)
     return np.column_stack([t, u, y])
+
+
+class QuadrupleTankLevels(QuadrupleTank):
+    """The same with all levels measured."""
+
+    outputs = QuadrupleTank.states
 
 
 class Bioreactor(Prior):
@@ -251,10 +260,10 @@ class Building(Prior):
         )
 
 
-def building(seed: int) -> Array:
+def building(seed: int, name: str = "building") -> Array:
     """Four heat stores, infiltration that the user forgot, a thermostat at times."""
     rng = np.random.default_rng([seed, 6])
-    n, dt, plant = 1440, 600.0, PLANTS["building"]
+    n, dt, plant = 1440, 600.0, PLANTS[name]
     hours = dt / 3600 * np.arange(n)
     outside = 5 + 6 * np.sin(2 * np.pi * (hours - 15) / 24) + np.cumsum(rng.standard_normal(n)) * 0.1
     sun = (
@@ -270,6 +279,12 @@ def building(seed: int) -> Array:
     t, u, y = run(plant, lambda k, y: power[k : k + 1], dt, n, 8, w=weather)
     y = drop_outs(quantised(y + 0.05 * rng.standard_normal(y.shape), 0.0625), rng, 0.03, 12)
     return np.column_stack([t, u, outside + 0.1 * rng.standard_normal(n), sun, y])
+
+
+class BuildingWalls(Building):
+    """The same with the walls' temperature measured."""
+
+    outputs = Building.states
 
 
 PROCESSES = (
@@ -306,3 +321,16 @@ PROCESSES = (
         {"C_i": 1.85, "C_m": 17.0, "H_im": 0.7, "H_mo": 0.29, "A_w": 3.0}, False,
     ),
 )  # fmt: skip
+WHOLE = (
+    replace(
+        PROCESSES[1], name="quadruple_tank_levels", prior=QuadrupleTankLevels,
+        spec=replace(PROCESSES[1].spec, outputs=("h1", "h2", "h3", "h4")),
+        record=partial(quadruple_tank, name="quadruple_tank_levels"), header="t,v1,v2,h1,h2,h3,h4",
+    ),
+    replace(
+        PROCESSES[5], name="building_walls", prior=BuildingWalls,
+        spec=replace(PROCESSES[5].spec, outputs=("T_i", "T_m")), record=partial(building, name="building_walls"),
+        header="t,heat,T_o,sun,T_i,T_m",
+    ),
+)  # fmt: skip
+"""Two of them with every state of the prior measured."""

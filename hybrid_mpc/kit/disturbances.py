@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -78,6 +79,17 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     return None if best is None else _plain(best)
 
 
+def rates_of_outputs(model: HybridModel, control: OCP) -> tuple[Disturbance, ...] | None:
+    """A disturbance at the rate of the state that each output measures; None if outputs measure no states of their own,
+    or if they do not distinguish the disturbances from the states.
+
+    Its size is the effect of parameter errors of :data:`OFF`, or what moves the state by its size within half a
+    horizon if that is more. Example: ``replace(model, disturbance_model=rates_of_outputs(model, control))``.
+    """
+    found = _with_rates(model, control, range(model.n_y), Sizes(model, control))
+    return found.disturbance_model if found is not None and offset_free(found).detectable else None
+
+
 def _plain(model: HybridModel) -> tuple[Disturbance, ...] | None:
     """The disturbance model of a model; None if it is one at each input."""
     each = tuple(Disturbance("input", s.name) for s in model.inputs)
@@ -89,13 +101,15 @@ def _with_inputs(model: HybridModel, places: tuple[int, ...], own: list[Disturba
     return replace(model, disturbance_model=chosen)
 
 
-def _with_rates(model: HybridModel, control: OCP, held: list[int], sizes: Sizes) -> HybridModel | None:
-    """The model with disturbances of the rates of the states that controlled outputs measure (for positions: of their
+def _with_rates(model: HybridModel, control: OCP, held: Sequence[int], sizes: Sizes) -> HybridModel | None:
+    """The model with disturbances of the rates of the states that outputs ``held`` measure (for positions: of their
     speeds), and of the other outputs; None if an output does not depend on exactly one state.
     """
     rows = output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full()
-    # share of the horizon within which a disturbance of a rate moves the state by the state's size
-    speeds, reach = kinematics(model), 0.5 * control.horizon * model.dt
+    # a disturbance of a rate moves the state by the state's size within half a horizon, or as errors of parameters do
+    speeds, found = kinematics(model), [sizes.states / (0.5 * control.horizon * model.dt)]
+    found += [np.sqrt(np.sum(off[: model.n_x] ** 2, axis=1)) / model.dt for _, off in _errors(model, control)]
+    rates = np.max(found, axis=0)
     chosen: list[Disturbance] = []
     for i, signal in enumerate(model.outputs):
         if i not in held:
@@ -105,7 +119,7 @@ def _with_rates(model: HybridModel, control: OCP, held: list[int], sizes: Sizes)
         if shown.size != 1:
             return None
         place = speeds.get(int(shown[0]), int(shown[0]))
-        chosen.append(Disturbance("rate", model.states[place].name, float(sizes.states[place] / reach)))
+        chosen.append(Disturbance("rate", model.states[place].name, float(rates[place])))
     if len({(d.at, d.signal) for d in chosen}) < len(chosen):
         return None
     return replace(model, disturbance_model=tuple(chosen))

@@ -206,7 +206,7 @@ def test_the_delay_that_the_margins_allow_is_the_delay_that_the_rig_stands(golf_
                 scenario.plant(), given.filters["prior", mode], controller, task.reference, dt=0.02, duration=4.0,
                 x0=np.array(task.x0), seed=0, input_delay=delay,
             )  # fmt: skip
-            restless.append(np.sqrt(np.mean(np.diff(run.u[50:, 0]) ** 2)))
+            restless.append(np.std(run.u[50:, 0]))  # not of its moves: those of the jump filter are noise
         # A loop that stands the delay moves its input as the task asks; one that does not swings between its bounds.
         assert restless[1] < 1.3 * restless[0]
         assert restless[2] > 1.5 * restless[1]
