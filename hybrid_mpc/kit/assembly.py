@@ -202,7 +202,7 @@ def _ask_for_point(model: HybridModel) -> str:
     if model.x0.any() or model.u0.any():
         return ""
     return (
-        "All states and inputs are zero there: declare the point at which the machine works in the prior, "
+        "All states and inputs are zero at this point: declare the operating point of the machine in the prior, "
         "operating_point = OperatingPoint(x=(...), u=(...)). "
     )
 
@@ -599,8 +599,8 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
         )
     if model.delay_states:
         raise InputError(
-            f"adaptive guard: model {model.name} has delayed inputs, which it does not support. Use guard rest or prior"
-            " [HM-KIT-022]"
+            f"adaptive guard: model {model.name} has delayed inputs, which the adaptive guard does not support. Use "
+            "guard rest or prior [HM-KIT-022]"
         )
     others = {
         name: names
