@@ -374,8 +374,8 @@ oracle, oracle_state
         oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and set(self.solvers) != {"rti"}:
             raise InputError(
-                f"study: controller {oracles[0]} has a solver of its own (several starts). Remove it, or solvers"
-                " [HM-COMPARE-030]"
+                f"study: controller {oracles[0]} always uses its own solver (several starts). Remove it, or solvers "
+                "[HM-COMPARE-030]"
             )
         if oracles and self.vary:
             raise InputError(
