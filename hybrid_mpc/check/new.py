@@ -84,10 +84,10 @@ class Draft:
 
     @property
     def sampling(self) -> str:
-        """The sampling periods in words, each once: ``0.01 s, 0.02 s; the longest is the model's period``."""
+        """The sampling periods in words, each once: ``0.01 s, 0.02 s; the longest is the model period``."""
         each = [f"{period:.4g} s" for period in sorted(self.periods or (self.period,))]
         each = list(dict.fromkeys(each))
-        return ", ".join(each) + ("; the longest is the model's period" if len(each) > 1 else "")
+        return ", ".join(each) + ("; the longest is the model period" if len(each) > 1 else "")
 
     @property
     def unsure(self) -> dict[str, str]:

@@ -124,9 +124,7 @@ class _Library:
         v_unit, q_unit = state.unit, state.unit.removesuffix("/s")
         at: dict[str, Any] = {"width": width, "place": place}
         yield laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at)
-        yield laws.asymmetric(
-            own, weight("F_a", 1.0, words="direction dependence of dry friction"), **at
-        )
+        yield laws.asymmetric(own, weight("F_a", 1.0, words="direction dependence of dry friction"), **at)
         yield laws.viscous(own, weight("d", speed, (v_unit,), True, "viscous friction"), place=place)
         yield laws.viscous_by_direction(
             own, weight("d_a", speed, (v_unit,), words="viscous friction by direction"), place=place

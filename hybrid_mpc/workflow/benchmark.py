@@ -334,9 +334,7 @@ def benchmark(
     check_scenario(replace(scenario, plant=None))  # a benchmark runs no closed loop
     data, tests, warnings = _read(settings, scenario)
     for warning in warnings:
-        if (
-            data is None or warning not in data.dataset.warnings
-        ):  # stage data reports the warnings about recordings
+        if data is None or warning not in data.dataset.warnings:  # stage data reports the others
             progress.warn(warning)
     if data is None:
         context = _finished(settings, scenario, progress)
