@@ -271,8 +271,8 @@ def _check_recordings(
                 beyond = max(low - value, value - high)
                 if beyond > 0.5 * (high - low) and not signal.periodic:
                     report.warn(
-                        f"recordings: {signal.label} ranges from {low:.4g} to {high:.4g}, but at the operating point "
-                        f"it is {value:.4g}. Record there, or correct the operating point or a unit"
+                        f"recordings: {signal.label} ranges from {low:.4g} to {high:.4g}, but is {value:.4g} at the "
+                        "operating point. Record at the operating point, or correct this point or a unit"
                     )
     return dataset
 

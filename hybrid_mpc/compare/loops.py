@@ -134,7 +134,7 @@ class LoopSpec:
             known(self.guard, GUARDS[1:], "guard")
         if self.guard and (self.monitor not in ALARMING or not _is_watched(self.controller)):
             raise InputError(
-                f"guard: it reacts to alarms, so it needs a controller with the hybrid and monitor "
+                "guard: a guard reacts to alarms, so it needs a controller with the hybrid and monitor "
                 f"{' or '.join(ALARMING)}; got controller {self.controller} and monitor {self.monitor} [HM-COMPARE-003]"
             )
         for name in ("faults", "drawn_faults"):
@@ -339,7 +339,7 @@ class Bench:
         others = () if spec.scenario == own else registered_scenarios()
         if spec.scenario in others and load_scenario(spec.scenario).name != own:
             raise InputError(
-                f"loop: it belongs to scenario {spec.scenario}, but the bench has {own}. Make a bench of its scenario "
+                f"loop: belongs to scenario {spec.scenario}, but the bench has {own}. Make a bench of its scenario "
                 "[HM-COMPARE-010]"
             )
         return self.kits[known(spec.model, self.kits, "model on the bench")]

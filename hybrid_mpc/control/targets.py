@@ -124,7 +124,7 @@ class Targets:
         goal = np.asarray(y_ref, dtype=float).ravel()
         if goal.size != m.n_y or not np.all(np.isfinite(goal[self._tracked])):
             raise InputError(
-                f"y_ref: must have {m.n_y} outputs, finite where q_y weighs them, got {goal} [HM-CONTROL-055]"
+                f"y_ref: must have {m.n_y} outputs, finite for weighted outputs, got {goal} [HM-CONTROL-055]"
             )
         d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
         w = m.w if w is None else vector(w, m.n_w, "w")

@@ -299,7 +299,7 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Arr
     )
     noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
     raise InputError(
-        f"observer of model {model.name}: it never estimates a load at {where}, because its process noise ({noise} a "
+        f"observer of model {model.name}: a load at {where} is never estimated, because the process noise ({noise} per "
         "period) explains every load. A constant load would cause an offset. Correct the prior, set "
         "Scenario(state_noise={...}), or run the scenario again [HM-KIT-013]"
     )

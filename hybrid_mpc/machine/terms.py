@@ -716,7 +716,7 @@ def elastic_end(of: str, stiffness: Parameter, *, edge: float, upper: bool) -> T
     return _added(
         "elastic_end", f"{'upper' if upper else 'lower'} elastic end", "potential", of, (stiffness,),
         lambda at, p: 0.5 * p[0] * ca.fmax(side * (at.position - edge), 0.0) ** 2,
-        f"-{stiffness.name} (q - {edge:.3g}) beyond it", edge=edge, upper=upper,
+        f"-{stiffness.name} (q - {edge:.3g}) beyond this edge", edge=edge, upper=upper,
     )  # fmt: skip
 
 

@@ -171,7 +171,7 @@ class WatchLimits:
         for what, own, given in (("a period", self.dt, dt), ("a time unit", self.time_unit, time_unit)):
             if abs(own - given) > 1e-9 * own:
                 raise InputError(
-                    f"limits: learned with {what} of {own:g} s, but the model has {given:g} s. Learn them again "
+                    f"limits: learned with {what} of {own:g} s, but the model has {given:g} s. Learn the limits again "
                     "[HM-WATCH-008]"
                 )
 
