@@ -537,8 +537,8 @@ def _choose_failure_remedy(point: SetPoint, failing: Trial) -> str:
     at = (before >= problem.u_max - edge) | (before <= problem.u_min + edge)
     if ran_away or solved.all() or (at.size and at.mean(axis=0).max() > 0.5):
         return (
-            "The inputs cannot compensate these loads and errors. Use set-points farther from the limits of the inputs, "
-            "a stronger actuator, a shorter period, or a better prior."
+            "The inputs cannot compensate these loads and errors. Use set-points farther from the limits of the "
+            "inputs, a stronger actuator, a shorter period, or a better prior."
         )
     finite = "write a prior that is finite beyond the ranges of its states (docs/unstable.md)"
     tenfold = _compute_growth(point)

@@ -42,7 +42,7 @@ ALIKE = 0.8  # least similarity of two recording names that differ by a typo
 FEWEST = 10  # fewest time stamps that show whether the sampling is uniform
 UNEVEN = 1e-3  # relative deviation above which two steps differ
 COARSE = 1.5  # largest sampling period in model periods: beyond it, interpolation would invent samples
-NOISE_SHARE = 0.01  # share of a signal's range that a sample may be beyond it: the noise of a sensor at its end
+NOISE_SHARE = 0.01  # tolerated distance from a signal's range, in ranges: noise of a sensor at its end
 ROUNDING = 1e-9  # relative distance from an end of a sensor's range within which a sample is at that end
 TIME = Signal("time", "s")
 
