@@ -153,7 +153,7 @@ class LocalEngine(Engine[B, R]):
                 self._pool, broken = None, error
         else:
             raise RuntimeError(
-                f"new processes end at once ({type(broken).__name__}: {broken}). Check memory and the process limit"
+                f"new processes end immediately ({type(broken).__name__}: {broken}). Check memory and the process limit"
             ) from broken
         self._pools[future] = self._pool
         self._watch(future, batch)
@@ -492,6 +492,6 @@ def _connected(address: str) -> Any:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"scheduler {address}: no answer within {CONNECT_S:g} s ({type(error).__name__}). Start one with "
-            "'dask scheduler', or leave out --scheduler to use this machine. [HM-ENGINE-005]"
+            f"scheduler {address}: no answer within {CONNECT_S:g} s ({type(error).__name__}). Start one with 'dask "
+            "scheduler', or omit --scheduler to use this machine. [HM-ENGINE-005]"
         ) from error

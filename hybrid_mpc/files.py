@@ -84,8 +84,8 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         cause = error.__cause__ if isinstance(error, StorageError) and error.__cause__ else error
         kept = "it is unchanged" if there else "no partial files are left"
         raise StorageError(
-            f"{folder}: cannot be written: {reason(cause)}; {kept}. Free space there or choose another folder, "
-            "and repeat the command. [HM-FILES-001]"
+            f"{folder}: cannot be written: {reason(cause)}; {kept}. Free disk space or choose another folder, and "
+            "repeat the command. [HM-FILES-001]"
         ) from error
 
 

@@ -57,11 +57,10 @@ def _check_place(out: Path, noun: str, resume: bool | None) -> None:
                 f"{out}: exists and is not the folder of a {noun}. Choose another --out. [HM-FOLDER-002]"
             )
         if resume and not (out / LOCK).is_file():  # a job that ended before its note leaves only the lock
-            raise InputError(f"{out}: holds no {noun} to resume. Leave out --resume. [HM-FOLDER-003]")
+            raise InputError(f"{out}: contains no {noun} to resume. Omit --resume. [HM-FOLDER-003]")
     elif resume is False:
         raise InputError(
-            f"{out}: already holds a {noun}. Add --resume to continue it, or choose another --out."
-            " [HM-FOLDER-004]"
+            f"{out}: already contains a {noun}. Add --resume to continue it, or choose another --out. [HM-FOLDER-004]"
         )
 
 
@@ -94,8 +93,8 @@ def _check_settings(out: Path, note: JobNote) -> None:
     held, own = read_note(out, note.noun)["settings"], note.settings
     if differ := sorted(k for k in {**own, **held} if digest(held.get(k)) != digest(own.get(k))):
         raise InputError(
-            f"{out}: holds a {note.noun} with other settings ({', '.join(differ)} differ). Give the same settings to "
-            "continue it, or choose another --out. [HM-FOLDER-005]"
+            f"{out}: contains a {note.noun} with other settings ({', '.join(differ)} differ). Give the same settings "
+            "to continue it, or choose another --out. [HM-FOLDER-005]"
         )
 
 

@@ -275,8 +275,8 @@ def scenario_of(named: str, where: Path, given: str = "") -> Scenario | None:
         return None
     if named not in registered_scenarios():
         raise InputError(
-            f"{where} names the scenario {named!r}, which is not registered. If it is yours, give its file: "
-            "--scenario FILE.py [HM-SCENARIO-004]"
+            f"{where} names the scenario {named!r}, which is not registered. For a scenario of your own, give its "
+            "file: --scenario FILE.py [HM-SCENARIO-004]"
         )
     return load_scenario(named)
 

@@ -93,8 +93,9 @@ class Batched:
         """Refuse a function that torch operators do not stand for."""
         if self.steps is None:
             raise ExportError(
-                f"{self.function.name()} has no form in torch operators (a solver, a table, external code, or more "
-                f"than {MAX_WALK} operations): it can be trained with on the CPU, but not be exported or moved [NN-001]"
+                f"{self.function.name()} cannot be written in torch operators (a solver, a table, external code, or "
+                f"more than {MAX_WALK} operations): training on the CPU works, but not export or another device "
+                "[NN-001]"
             )
 
     def walk(self, args: list[Tensor], shape: torch.Size | tuple[int, ...]) -> list[Tensor]:
@@ -134,7 +135,8 @@ class Batched:
             evaluate()
             if buffer.ret():
                 raise ExportError(
-                    f"{f.name()}: CasADi could not evaluate it; call it with one sample to see why [NN-002]"
+                    f"{f.name()}: CasADi could not evaluate it; call the function with one sample to see the reason "
+                    "[NN-002]"
                 )
             start += count
         return [torch.from_numpy(r).reshape(*shape, r.shape[1]).to(device) for r in results]

@@ -88,10 +88,12 @@ class Budget:
         measure = next(m for m in _MEASURES if totals[m] > getattr(limits, m))
         earlier = totals[measure] - cost[measure]
         raise ProgramError(
-            f"{what}: it would come to {_count(cost[measure])} {_MEASURES[measure]}"
+            f"{what} needs {_count(cost[measure])} {_MEASURES[measure]}"
             + (f" with {_count(earlier)} before it" if earlier else "")
-            + f", the limit is {_count(getattr(limits, measure))}; if you know where it is from, raise the limit: "
-            f"limits=nn_export.Limits({measure}=...) [NN-112]"
+            + (
+                f", the limit is {_count(getattr(limits, measure))}; if you trust the source of the file, raise the "
+                f"limit: limits=nn_export.Limits({measure}=...) [NN-112]"
+            )
         )
 
     def add(self, program: Program, where: str = "") -> None:

@@ -208,7 +208,7 @@ def _compiler(given: str | None) -> list[str] | None:
             return words
     if given:
         raise CompileError(
-            f"compiler {given!r}: no such command; install it or leave the argument out [NN-007]"
+            f"compiler {given!r}: no such command; install the compiler, or omit the argument [NN-007]"
         )
     return None
 
@@ -238,7 +238,7 @@ def _source(functions: list[ca.Function]) -> str:
         ) from error
     if kinds := sorted(set(re.findall("#error Code generation not supported for (.*)", text))):
         raise CompileError(
-            f"{functions[0].name()} cannot be written as C: CasADi has no C for {', '.join(kinds)}; leave "
+            f"{functions[0].name()} cannot be written as C: CasADi cannot generate C for {', '.join(kinds)}; keep "
             "callbacks and solvers outside the function [NN-011]"
         )
     return text
@@ -258,11 +258,12 @@ def _named_folder(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
         raise CompileError(
-            f"{folder} cannot be made: {error.strerror}; take another folder [NN-012]"
+            f"{folder} cannot be created: {error.strerror}; choose another folder [NN-012]"
         ) from error
     if reason := _distrust(folder, stat.S_ISDIR, 0o022):
         raise CompileError(
-            f"{folder}: {reason}, so somebody else's code could be run; take a folder of your own, chmod 700 [NN-013]"
+            f"{folder}: {reason}, so code of another user could run; choose a folder that only you can write (chmod "
+            "700) [NN-013]"
         )
     return folder
 
@@ -335,8 +336,8 @@ def _build(source: str, folder: Path, key: str, command: list[str], timeout: flo
             done = subprocess.run(words, capture_output=True, text=True, timeout=timeout, check=False)
         except subprocess.TimeoutExpired as error:
             raise CompileError(
-                f"the C compiler took more than {timeout:g} s; take -O0 or -O1, a matrix (MX) graph instead of a "
-                "scalar one, or a longer timeout [NN-014]"
+                f"the C compiler took more than {timeout:g} s; use -O0 or -O1, a matrix (MX) graph instead of a scalar "
+                "one, or a longer timeout [NN-014]"
             ) from error
         if done.returncode or not library.is_file():
             raise CompileError(f"{shlex.join(words)} failed:\n{done.stderr[-2000:]} [NN-015]")

@@ -79,7 +79,7 @@ def _check_mutations(exported: torch.export.ExportedProgram) -> None:
     names = [str(s.target) for s in exported.graph_signature.output_specs if s.kind in changed]
     if names:
         raise HiddenStateError(
-            f"the module writes into {', '.join(names)}: take the state as an input, return the new one [NN-018]"
+            f"the module writes into {', '.join(names)}: make the state an input, and return the new state [NN-018]"
         )
 
 
@@ -180,8 +180,8 @@ _DRAWN = (
     "(F.dropout needs training=self.training, BatchNorm track_running_stats=True) [NN-118]:"
 )
 _UNKNOWN = (
-    "operators or arguments that nn_export does not know; write them with others (docs/operators.md is the "
-    "table), or compute them outside the module [NN-119]:"
+    "operators or arguments that nn_export does not support; use other operators (docs/operators.md), or compute them "
+    "outside the module [NN-119]:"
 )
 _NARROW = (
     "results computed in less than float64, which the export would not repeat; use dtype=torch.float64 or "

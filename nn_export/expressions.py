@@ -63,14 +63,13 @@ def scalar_steps(function: ca.Function, most: int) -> list[Step]:
             calls = calls or last_line(error)
         if calls:
             raise UnsupportedOperatorError(
-                f"{function.name()}: no scalar operations stand for {calls}; write it with operations of scalars alone"
-                " [NN-024]"
+                f"{function.name()}: {calls} cannot be written in scalar operations; use scalar operations only "
+                "[NN-024]"
             )
         if f.n_instructions() <= most:
             return [_step(f, k) for k in range(f.n_instructions())]
     raise ProgramError(
-        f"{function.name()}: more than {most} scalar operations; write it with fewer, or export a network as a module"
-        " [NN-025]"
+        f"{function.name()}: more than {most} scalar operations; use fewer, or export a network as a module [NN-025]"
     )
 
 
@@ -195,8 +194,7 @@ class _Writer:
             return self._node("aten.where.self", [*args, 0.0])
         if code not in _OPERATORS:
             raise UnsupportedOperatorError(
-                f"{self._function.name()}: no operator stands for {_NAMES.get(code, code)}; write it with others"
-                " [NN-028]"
+                f"{self._function.name()}: {_NAMES.get(code, code)} is not supported; use other operations [NN-028]"
             )
         if code in _COMMUTATIVE and not _is_reference(args[1]):
             args = args[::-1]

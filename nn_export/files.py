@@ -149,7 +149,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         seen: set[str] = set()
         twice = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
-        raise ValueError(f"{twice!r:.60} stands twice in one object [NN-037]")
+        raise ValueError(f"{twice!r:.60} appears twice in one object [NN-037]")
     return found
 
 

@@ -103,7 +103,7 @@ def graph(
         _size(f"output {port.name}", port.shape)
         if not isinstance(value, Value) or value.shape != port.shape:
             raise ProgramError(
-                f"output {port.name}: {port.source} has not its shape {port.shape}; export again [NN-039]"
+                f"output {port.name}: {port.source} does not have the shape {port.shape}; export again [NN-039]"
             )
         results.append(value)
     return symbols, results
@@ -140,13 +140,13 @@ def _evaluate(node: Node, values: dict[tuple[str, str], Any], table: Mapping[str
         raise ShapeError(f"{place(node)}: {error}") from error
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError) as error:
         raise ProgramError(
-            f"{place(node)}: arguments that nn_export does not know: {error} [NN-041]"
+            f"{place(node)}: arguments that nn_export does not support: {error} [NN-041]"
         ) from error
     except (NotImplementedError, MemoryError) as error:
         raise ProgramError(f"{place(node)}: cannot be built: {error} [NN-042]") from error
     if given != node.shapes:
         raise ProgramError(
-            f"{place(node)}: gives shapes {given}, the program says {node.shapes}; export again [NN-043]"
+            f"{place(node)}: gives shapes {given}, but the program declares {node.shapes}; export again [NN-043]"
         )
     return result
 

@@ -125,7 +125,7 @@ def _roles(step: ca.Function, n: int, states: Mapping[str, str] | None, held: Se
         states = {s: f"{s}_next" for s in inputs if f"{s}_next" in outputs}
     if not states:
         raise SignatureError(
-            f"{given}: no output is an input's name with _next; say states={{'x': 'output_0'}} [NN-045]"
+            f"{given}: no output is named like an input with _next; give states={{'x': 'output_0'}} [NN-045]"
         )
     if unknown := sorted((set(states) | set(held)) - set(inputs)) + sorted(
         set(states.values()) - set(outputs)
@@ -133,7 +133,7 @@ def _roles(step: ca.Function, n: int, states: Mapping[str, str] | None, held: Se
         raise SignatureError(f"{given}: it has no {', '.join(unknown)}; choose among these [NN-046]")
     if both := sorted(set(states) & set(held)):
         raise SignatureError(
-            f"{given}: {', '.join(both)} cannot be a state and held; leave it out of one [NN-047]"
+            f"{given}: {', '.join(both)} cannot be both a state and held; remove it from one of the two [NN-047]"
         )
     if len(set(states.values())) < len(states):
         raise SignatureError(

@@ -71,7 +71,7 @@ def save_programs(folder: str | Path, programs: Mapping[str, Program]) -> None:
         text = dumps(document)
     except (TypeError, ValueError, RecursionError) as error:
         raise ProgramError(
-            f"a program holds something that JSON has no form for: {error} [NN-084]"
+            f"a program contains a value that JSON cannot represent: {error} [NN-084]"
         ) from error
     path = Path(folder)
     write_bytes(path / WEIGHTS, blob)

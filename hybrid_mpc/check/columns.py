@@ -26,12 +26,14 @@ Array = NDArray[np.float64]
 MOST_RECORDED = 1e-3 * LARGEST
 """Largest number of a signal; the signal's range, wider than the recording, must stay below ``LARGEST``."""
 COUNTED = (
-    "the column counts samples and is used as the time, since no column is named as time. Write the seconds of one "
-    "count into units, and multiply all lengths below by it"
+    "the column counts samples. It is used as the time, because no column is named as time. Write the sampling period "
+    "[s] into units, and multiply all times below by this period"
 )
 """Doubt about a time that is a count of samples."""
-UNNAMED = "the column rises evenly and no column is named as time. Check that it is the time in seconds"
-NO_UNIT = "its name has no unit. Check that it is in seconds"
+UNNAMED = (
+    "the column rises evenly, and no column is named as time. Check that this column is the time in seconds"
+)
+NO_UNIT = "the column name has no unit. Check that the time is in seconds"
 EPOCHS = ((1e18, 1e-9), (1e15, 1e-6), (1e12, 1e-3), (1e9, 1.0))
 """Smallest time since 1970 (in the year 2001) in each unit [s]; a number five times larger (after 2130) is no epoch."""
 UNIT = re.compile(r"[\w/^*·.%°²³µμΩ() -]{1,20}")
@@ -145,7 +147,7 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
         for source, (read, reasons), rows in zip(sources, tables, usual, strict=True):
             where = f" in {source.path.name}" if len(sources) > 1 else ""
             if full not in read:
-                problems.append(reasons.get(full, f"it is missing in {source.path.name}"))
+                problems.append(reasons.get(full, f"missing in {source.path.name}"))
                 continue
             one = read[full]
             pieces.append(one.values[:, 0])
@@ -153,13 +155,13 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
                 problems.append(f"{one.faults[full]}{where}")
             elif rows and len(one.values) not in (1, rows):
                 problems.append(
-                    f"it has {counted(len(one.values), 'value')}{where}, but the other columns have {rows}"
+                    f"{counted(len(one.values), 'value')}{where}, but the other columns have {rows}"
                 )
             elif (k := _diverges(pieces[-1])) is not None:
                 diverged.append(
-                    f"{source.path}: {one.place(k)}, column {shown(full)}: grows to "
-                    f"{np.nanmax(np.abs(pieces[-1])):.3g}; the recording or the simulation diverged. Cut the file "
-                    "before that row, or leave out the recording. [HM-CHECK-003]"
+                    f"{source.path}: {one.place(k)}, column {shown(full)} grows to "
+                    f"{np.nanmax(np.abs(pieces[-1])):.3g}; the recording or the simulation diverged. Delete the rows "
+                    "from there on, or remove the recording. [HM-CHECK-003]"
                 )
         known = np.concatenate([piece[np.isfinite(piece)] for piece in pieces]) if pieces else np.zeros(0)
         if problem := column_problem(full):
@@ -167,13 +169,13 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
         elif problems:
             left_out[full] = problems[0]
         elif not len(known):
-            left_out[full] = "it has no number"
+            left_out[full] = "no number"
         elif len(known) < FEWEST or max(map(len, pieces)) == 1:
-            left_out[full] = f"it has {counted(len(known), 'number')}, fewer than {FEWEST}"
+            left_out[full] = f"{counted(len(known), 'number')}, fewer than {FEWEST}"
         elif known.min() == known.max():
-            left_out[full] = f"it is constant at {known[0]:g}"
+            left_out[full] = f"constant at {known[0]:g}"
         elif np.abs(known).max() > MOST_RECORDED:
-            left_out[full] = f"it reaches {np.abs(known).max():g}, more than any machine"
+            left_out[full] = f"reaches {np.abs(known).max():g}, too large for a machine"
         else:
             inner = FIELD.fullmatch(full)
             name, unit = name_and_unit(inner[1] if inner else full)
@@ -192,8 +194,8 @@ def columns_of(sources: Sequence[Source]) -> tuple[dict[str, Column], dict[str, 
     if not found:
         why = "".join(f"\n  {shown(name)}: {reason}" for name, reason in left_out.items())
         raise InputError(
-            f"{sources[0].path}: no column has {FEWEST} numbers that move. Give a recording in which the machine moves."
-            f"{sources[0].note}{why} [HM-CHECK-004]"
+            f"{sources[0].path}: no column has {FEWEST} numbers that vary. Give a recording in which the machine "
+            f"moves.{sources[0].note}{why} [HM-CHECK-004]"
         )
     return found, left_out
 
@@ -295,9 +297,7 @@ def clock_of(
     full, clocks, problems = first.column.full, list[Clock](), list[str]()
     for source in sources:
         clock = (
-            _clock(source, full, said_by(full))
-            if full in source.header
-            else f"it is missing in {source.path.name}"
+            _clock(source, full, said_by(full)) if full in source.header else f"missing in {source.path.name}"
         )
         if isinstance(clock, Clock):
             clocks.append(clock)
@@ -349,7 +349,7 @@ def _time(
         lost = [name for name in source.unread if said_by(name).kind == "time"]
         if troubles or lost:
             role = "was given as the time" if asked else "is the time by its name"
-            many = troubles | dict.fromkeys(lost, f"its kind is not supported.{source.note}")
+            many = troubles | dict.fromkeys(lost, f"its data type is not supported.{source.note}")
             refuse([
                 f"{source.path}: column {shown(name)} {role} and cannot be used: {trouble} [HM-CHECK-006]"
                 for name, trouble in many.items()
@@ -367,7 +367,9 @@ def _time(
             clock = _clock(source, full, one)
             if isinstance(clock, Clock) and counts is (one.kind == "count" or _is_count(column.values)):
                 return clock._replace(doubt=COUNTED if counts else UNNAMED)
-    return Clock(None, 1.0, doubt="give the sampling period [s]; no column of the recording looks like time")
+    return Clock(
+        None, 1.0, doubt="no column of the recording looks like a time. Give the sampling period [s]"
+    )
 
 
 def _clock(source: Source, full: str, said: Said) -> Clock | str:
@@ -375,7 +377,9 @@ def _clock(source: Source, full: str, said: Said) -> Clock | str:
     if source.header.count(full) > 1:
         return "its name appears more than once in the header. Rename all but one"
     if said.unit and said.seconds is None:
-        return f"its unit {said.unit!r} is not one of time. Write seconds, or name the unit, e.g. 'time [ms]'"
+        return (
+            f"its unit {said.unit!r} is not a unit of time. Write seconds, or name the unit, e.g. 'time [ms]'"
+        )
     try:
         columns = source.read(None, [full], ())
     except InputError as error:
@@ -384,13 +388,13 @@ def _clock(source: Source, full: str, said: Said) -> Clock | str:
         return "; ".join(columns.problems)
     t = columns.values[:, 0]
     if not len(t):
-        return "it has no number"
+        return "no number"
     seconds = said.seconds or 1.0
     if not said.unit and said.kind:
         epoch = next(((least, unit) for least, unit in EPOCHS if least <= t[0] < 5 * least), None)
         seconds = epoch[1] if epoch else 1.0
         if said.is_date and epoch is None:
-            return "the unit of its dates is unknown. Write seconds since the beginning"
+            return "the unit of the dates is unknown. Write seconds since the start of the recording"
     column = Column(full, *name_and_unit(full), t, (len(t),))
     if len(t) == 1:
         fine = 0 < t[0] < math.inf
@@ -400,7 +404,7 @@ def _clock(source: Source, full: str, said: Said) -> Clock | str:
             else f"its sampling period {t[0]:g} is not positive"
         )
     if np.abs(t).max() * seconds > MOST_RECORDED:
-        return f"it reaches {np.abs(t).max():g}, more than any time"
+        return f"reaches {np.abs(t).max():g}, too large for a time"
     if disorder := columns.disorder(seconds * t, f"column {shown(full)}"):
         return disorder
     return Clock(column, seconds * float(np.median(np.diff(t))), seconds)
@@ -429,12 +433,12 @@ def no_signal(column: Column) -> str:
     said = said_by(column.full)
     even = _mostly_even(column.values)
     if said.kind == "time" and (even or not said.perhaps):
-        return "by its name it is a time"
+        return "the time by its name"
     if said.kind == "step":
-        return "by its name it is a sampling period"
+        return "the sampling period by its name"
     if said.kind == "count" and (not said.perhaps or (even and _is_count(column.values))):
-        return "it counts samples" if column.name else "it has no name"
-    return "it rises evenly, like a time" if _rises(column.values) else ""
+        return "a counter of samples" if column.name else "no name"
+    return "rises evenly, like a time" if _rises(column.values) else ""
 
 
 def _rises(values: Array) -> bool:

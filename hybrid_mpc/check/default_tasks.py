@@ -145,7 +145,7 @@ def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None)
         >>> from hybrid_mpc.scenario import load_scenario
         >>> golf = load_scenario("golf_robot")
         >>> [task.title for task in default_tasks(replace(golf, tasks=()))]
-        ['A step of phi by 0.1 rad (default task)', 'Hold against -0.1 N m at u (default task)']
+        ['A step of phi by 0.1 rad (default task)', 'Hold against a load of -0.1 N m at u (default task)']
     """
     prior, control, dt = scenario.prior(values), scenario.control, scenario.data.dt
     assert control is not None
@@ -159,14 +159,14 @@ def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None)
     if not np.all(np.abs(rates) < RESTS):
         moving = ", ".join(s.name for s, r in zip(prior.states, rates, strict=True) if not abs(r) < RESTS)
         raise InputError(
-            f"{why}{moving} of the prior would not rest at the operating point. Give operating_point = "
-            "OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),). [HM-CHECK-007]"
+            f"{why}the operating point is not a steady state of the prior; {moving} would change. Give operating_point "
+            "= OperatingPoint(x=(...), u=(...)), or tasks=(Task(...),). [HM-CHECK-007]"
         )
     steps = _steps(rest)
     if not steps:
         raise InputError(
-            f"{why}no weighted signal of the control problem has another steady state within half of the distance to "
-            "the limits. Give tasks=(Task(...),). [HM-CHECK-008]"
+            f"{why}no weighted signal of the control problem can reach another steady state within half the distance "
+            "to its limits. Give tasks=(Task(...),). [HM-CHECK-008]"
         )
     return _step_task(rest, steps, dt), _hold_task(rest, dt)
 
@@ -218,7 +218,7 @@ def _hold_task(rest: _Rest, dt: float) -> Task:
         return np.hstack([np.tile(first, (len(t), 1)), np.zeros((len(t), n_p))])
 
     return Task(
-        "hold", f"Hold against {push:.3g} {signal.unit} at {signal.name} (default task)",
+        "hold", f"Hold against a load of {push:.3g} {signal.unit} at {signal.name} (default task)",
         _periods(LASTS * rest.horizon, dt), tuple(rest.x.tolist()), reference,
         faults=(Fault(_periods(LEAD * rest.horizon, dt), math.inf, "input_offset", push, several),),
     )  # fmt: skip

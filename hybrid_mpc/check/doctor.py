@@ -92,7 +92,7 @@ def _compiler() -> Finding:
             text = f"{command}: {lines[0]}" if lines else f"{command}, version unknown"
             return Finding("C compiler", text)
     what = f"CC = {named} is not a command" if named else "none found (cc, gcc, clang)"
-    remedy = "install a compiler to compile models; without one they run slower, in CasADi's virtual machine"
+    remedy = "install a compiler: without one, models run slower in CasADi's virtual machine"
     return Finding("C compiler", what, "absent", remedy)
 
 
@@ -116,8 +116,8 @@ def _gpu() -> Finding:
     text = ", ".join(name.strip() for name in names)
     if torch.endswith("+cpu"):
         remedy = "install torch with CUDA, then use --device cuda"
-        return Finding("GPU", f"{text}, but torch {torch} cannot use it", "absent", remedy)
-    return Finding("GPU", f"{text}; train on it with --device cuda" if torch else text)
+        return Finding("GPU", f"{text}, but torch {torch} cannot use this GPU", "absent", remedy)
+    return Finding("GPU", f"{text}; train with --device cuda" if torch else text)
 
 
 def _told(command: list[str]) -> str:

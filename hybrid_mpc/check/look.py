@@ -82,7 +82,7 @@ def look(path: Path) -> Look:
             note = "time"
         elif not note and len(known):
             findings += _odd(full, values)
-            note = "does not move" if len(known) > 1 and np.ptp(known) == 0 else ""
+            note = "constant" if len(known) > 1 and np.ptp(known) == 0 else ""
             note = note or (f"{len(values) - len(known)} blank" if len(known) < len(values) else "")
         inner = FIELD.fullmatch(full)
         own, unit = name_and_unit(inner[1] if inner else full)
@@ -111,23 +111,23 @@ def _time(source: Source, findings: list[str], rows: int) -> tuple[str, Array, s
         findings.append(str(error).removeprefix(f"{source.path}: "))
         return "not found", count, ""
     if clock.column is None:
-        return clock.doubt or "none found: rows are counted", clock.period * count, ""
+        return clock.doubt or "no time column: rows are numbered", clock.period * count, ""
     name, t = clock.column.full, clock.seconds * clock.column.values
     if len(t) == 1:
         return f"{shown(name)}: sampled every {clock.period:.4g} s", clock.period * count, name
     steps = np.diff(t)
     # least gap in the time, in median steps; ``new`` writes it as ``max_gap``
     gaps = np.flatnonzero(steps > 5.0 * clock.period)
-    told = f"{shown(name)}: {t[0]:.10g} to {t[-1]:.10g} s, sampled every {clock.period:.4g} s"
+    text = f"{shown(name)}: {t[0]:.10g} to {t[-1]:.10g} s, sampled every {clock.period:.4g} s"
     place = source.read(None, [name], ()).place
     if len(gaps):
         k = int(gaps[np.argmax(steps[gaps])])
         findings.append(f"gaps in the time: {len(gaps)}, the longest {steps[k]:.4g} s before {place(k + 1)}")
     for k in restarts(t):
-        findings.append(f"{place(k)}: time restarts; a recording is cut there")
+        findings.append(f"{place(k)}: time restarts; the recording is cut there")
     if clock.doubt:
         findings.append(f"time: {clock.doubt}")
-    return told, t, name
+    return text, t, name
 
 
 def _odd(full: str, values: Array) -> list[str]:
@@ -136,7 +136,8 @@ def _odd(full: str, values: Array) -> list[str]:
         count = int((values == code).sum())
         rows = counted(count, "row")
         return [
-            f"column {shown(full)}: {code:.10g} in {rows} is far from all others; probably a code for missing values"
+            f"column {shown(full)}: {code:.10g} in {rows} is far from all other values; probably a code for missing "
+            "values"
         ]
     if (odd := outliers(values)) is not None:
         return [

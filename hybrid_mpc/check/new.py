@@ -31,12 +31,12 @@ from hybrid_mpc.rules import LARGEST
 Array = NDArray[np.float64]
 MARK = "TODO"
 """Mark of everything that the user decides."""
-ACTING = "If they act on the machine instead: new ... --disturbance-column NAME"
+ACTING = "For a measured disturbance: new ... --disturbance-column NAME"
 """Remedy for a measured column that is no output."""
 SMOOTHED = 7
 """Fewest sampling periods of smoothing: a polynomial of order 4 needs six samples, and stamps are rounded."""
 GUESSED = 0.005
-"""Guessed error of a sensor whose noise the recordings do not show, in spans of the output."""
+"""Assumed error of a sensor whose noise the recordings do not show, in spans of the output."""
 INTEGRATES = "the recordings are too short to show a steady state"
 """Remark on the rate of an output that integrates."""
 HORIZONS = 20, 100
@@ -84,10 +84,10 @@ class Draft:
 
     @property
     def sampling(self) -> str:
-        """The sampling periods in words, each once: ``0.01 s, 0.02 s; the longest is the model's period``."""
+        """The sampling periods in words, each once: ``0.01 s, 0.02 s; the longest is the model period``."""
         each = [f"{period:.4g} s" for period in sorted(self.periods or (self.period,))]
         each = list(dict.fromkeys(each))
-        return ", ".join(each) + ("; the longest is the model's period" if len(each) > 1 else "")
+        return ", ".join(each) + ("; the longest is the model period" if len(each) > 1 else "")
 
     @property
     def unsure(self) -> dict[str, str]:
@@ -107,10 +107,11 @@ class Draft:
 
     @property
     def sensor_sigma(self) -> tuple[tuple[float, bool], ...]:
-        """Standard deviation of each sensor's error, and whether the recordings show it; else it is a guess.
+        """Standard deviation of each sensor's error, and whether the recordings show it; else the value is assumed.
 
-        Noise is what remains after three differences, and a sensor's smallest step over ``sqrt(12)`` at least. It shows
-        where a fourth difference finds (nearly) as much: a motion within three samples becomes smaller by each.
+        Noise is what remains after three differences, and a sensor's smallest step over ``sqrt(12)`` at least. The
+        noise is visible if the fourth difference gives nearly the same value: every further difference reduces the part
+        of a motion.
         """
         found = []
         for column in self.outputs:
@@ -133,7 +134,7 @@ class Draft:
 
     @property
     def effects(self) -> tuple[Column, ...]:
-        """What the first prior is linear in: inputs and disturbances, of a periodic one its sine and cosine."""
+        """Signals in which the first prior is linear: inputs and disturbances; sine and cosine of a periodic signal."""
         return (*self.inputs, *(own for c in self.disturbances for own in c.parts))
 
     @property
@@ -312,7 +313,7 @@ def draft_scenario(
         if not still:
             break
         free = [c for c in free if c.full not in still]
-        left_out |= dict.fromkeys(still, "it does not move in the training data")
+        left_out |= dict.fromkeys(still, "constant in the training data")
     used = {c.full for c in (*draft.signals, *draft.set_points)}
     left_out |= {c.full: verdicts[c.full].reason for c in free if c.full not in used}
     runs = draft.runs
@@ -348,12 +349,12 @@ def _left_to_user(
         if full in named or not given.get(verdict.kind):
             continue
         found[full] = Verdict(
-            "none", f"the user named other columns as {verdict.kind}; its reason: {verdict.reason}"
+            "none", f"other columns were given as {verdict.kind}; without them: {verdict.reason}"
         )
     kept = {full: found.get(full, verdict) for full, verdict in verdicts.items()}
     if given["input"] and not given["output"] and not any(v.kind == "output" for v in kept.values()):
         found |= {
-            full: Verdict("output", "it is the only column left", sure=False)
+            full: Verdict("output", "the only column left", sure=False)
             for full, verdict in verdicts.items()
             if full not in named and verdict.kind in ("input", "set-point")
         }
@@ -363,7 +364,7 @@ def _left_to_user(
 def _depends(draft: Draft, goal: Column) -> bool:
     """Whether a set-point explains half of what the outputs alone leave unexplained of an input, in most recordings.
 
-    So the input of a servo of small gain, whose output does not follow, shows that a loop acted.
+    This detects a loop of small gain, whose output does not follow the set-point.
     """
     explained = []
     for run, wanted in zip(draft.runs, goal.pieces, strict=True):
@@ -387,7 +388,7 @@ def _in_loop(draft: Draft) -> Draft:
     answered = feedback_of(runs)
     loop = ""
     if answered > CLOSED:
-        loop = f"inputs react to outputs, {answered:.1f} times more than by chance"
+        loop = f"inputs respond to outputs {answered:.1f} times more than by chance"
     elif any(draft.verdicts[c.full].sure for c in draft.set_points):  # unsure: no column follows it
         loop = "a column follows a set-point"
     elif any(_depends(draft, c) for c in draft.set_points):
@@ -690,7 +691,7 @@ def scenario_text(path: Path, data: Sequence[Path], draft: Draft) -> str:
         f"        {_text(spec.time) if isinstance(spec.time, str) else repr(spec.time)},"
         + (f"  # {MARK}: {printable(draft.doubt)}" if draft.doubt else ""),
         f"        {_tuple(map(_text, spec.inputs))},  # {MARK}: check that these are commanded",
-        f"        {_tuple(map(_text, spec.outputs))},  # {MARK}: check that the machine moves these. {ACTING}",
+        f"        {_tuple(map(_text, spec.outputs))},  # {MARK}: check that these are outputs. {ACTING}",
         *(
             f"        # {MARK}: check that {printable(name)} is {KINDS[draft.verdicts[name].kind]}: {printable(reason)}"
             for name, reason in draft.unsure.items()
@@ -773,7 +774,7 @@ def horizon_of(draft: Draft) -> tuple[int, str]:
 def first_limits(span: tuple[float, float], growth: float) -> tuple[float, float]:
     """Limits of an input in a first control problem: the recorded range.
 
-    An unstable machine falls over if its input stays at a limit. If the recorded input has both signs, its limits are
+    An unstable machine diverges if its input stays at a limit. If the recorded input has both signs, its limits are
     made symmetric: a recording from one initial state may hold mostly one sign.
 
     Args:
@@ -809,20 +810,21 @@ def _first_control(draft: Draft, n_x: int) -> list[str]:
     guessed = [printable(c.full) for c, (_, known) in zip(draft.outputs, sigmas, strict=True) if not known]
     origin = "" if len(guessed) == len(sigmas) else ", estimated from the recordings"
     return [
-        f"    # {MARK}: define the control problem. For a first loop remove the # in front:",
+        f"    # {MARK}: define the control problem. For a first loop, remove the # from these lines:",
         f"    # control=OCP({horizon}, {free}, u_min={low}, u_max={high},",
         f"    #             # {why}",
-        "    #             # weights: one over the square of a deviation that you tolerate",
+        "    #             # weights: 1 / (tolerated deviation)**2",
         f"    #             r_delta={each(draft.inputs, 0.1)}, q_y={each(draft.outputs, 0.05)}),",
         f"    # sensor_sigma={sigma},  # standard deviation of each sensor's error{origin}",
         *(
             [
-                f"    # {MARK}: sensor_sigma of {', '.join(guessed)} is assumed: see the data sheet, or record at rest"
+                f"    # {MARK}: sensor_sigma of {', '.join(guessed)} is assumed: take it from the data sheet, or "
+                "record at rest"
             ]
             if guessed
             else []
         ),
-        "    # safe_input=(...),  # within these limits, and harmless when a sensor is lost: only you know it",
+        "    # safe_input=(...),  # an input within these limits that is safe when a sensor fails",
     ]
 
 
@@ -831,8 +833,8 @@ def loop_lines(draft: Draft) -> list[str]:
     lines = []
     if draft.loop:
         lines.append(
-            f"the recordings seem to come from a closed loop ({draft.loop}). Free runs are biased there, so the fit "
-            "of the prior also uses predictions"
+            f"the recordings seem to come from a closed loop ({draft.loop}). Free runs are biased in a closed loop, so "
+            "the prior is also fitted to predictions"
         )
     if draft.growth:
         lines.append(

@@ -1,4 +1,4 @@
-"""Check that a prior's operating point is an equilibrium, and search for the equilibria beside one that is not."""
+"""Check that a prior's operating point is an equilibrium, and search for the equilibria next to one that is not."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def _places_of_inputs(prior: Prior) -> Places:
 
 
 def steady_point(prior: Prior) -> OperatingPoint | None:
-    """An equilibrium to replace an operating point that is none: its states with the input that holds them, else the
-    states that its input holds, else the nearest one of other states and inputs; None if none is found.
+    """Equilibrium that replaces an operating point that is not one: its states with the input that holds them, else the
+    steady states under its input, else the nearest equilibrium; None if none is found.
 
     Example:
         >>> class Tank(Prior):
@@ -75,21 +75,21 @@ def steady_point(prior: Prior) -> OperatingPoint | None:
 
 
 def both_ways(prior: Prior) -> str:
-    """The two equilibria beside an operating point that is none, as text to copy."""
+    """The two equilibria next to an operating point that is not one, as text to copy."""
     held, holding = held_states(prior), holding_input(prior)
-    states = "no states within their ranges" if held is None else f"x = {_numbers(held.x)}"
+    states = "none within the ranges" if held is None else f"x = {_numbers(held.x)}"
     inputs = _why_not_held(prior) if holding is None else f"u = {_numbers(holding.u)}"
     if holding is not None and any(
         abs(a - b) > 1e-9 * max(1.0, abs(b)) for a, b in zip(holding.x, rest_of(prior)[0], strict=True)
     ):
         inputs += f" with x = {_numbers(holding.x)}"
-    return f"States that your input holds: {states}. Input that holds your states: {inputs}"
+    return f"Steady states under your input: {states}. Input that holds your states: {inputs}"
 
 
 def _why_not_held(prior: Prior) -> str:
     """Why no input holds the operating point's states, and an equilibrium with one of its outputs, if there is one."""
-    text = "no input within its range" if _found(prior, _places_of_inputs(prior)).steady else (
-        f"none, not even beyond its range: {counted(len(prior.inputs), 'input')} cannot make "
+    text = "none within its range" if _found(prior, _places_of_inputs(prior)).steady else (
+        f"none, even without limits: {counted(len(prior.inputs), 'input')} cannot make "
         f"{counted(len(prior.states), 'rate')} zero at these states"
     )  # fmt: skip
     x, u, w = rest_of(prior)
@@ -99,7 +99,7 @@ def _why_not_held(prior: Prior) -> str:
         if np.flatnonzero(row).size == 1:
             free = np.delete(np.arange(len(x) + len(u)), np.flatnonzero(row))
             if (point := _search(prior, free)) is not None:
-                return f"{text}. With your {signal.name}: x = {_numbers(point.x)}, u = {_numbers(point.u)}"
+                return f"{text}. Steady state at your {signal.name}: x = {_numbers(point.x)}, u = {_numbers(point.u)}"
     return text
 
 
@@ -116,7 +116,7 @@ def _search(prior: Prior, free: Places) -> OperatingPoint | None:
     signals = (*prior.states, *prior.inputs)
     if not found.steady or not all(s.lower <= v <= s.upper for s, v in zip(signals, found.v, strict=True)):
         return None
-    # what the search left alone keeps its exact value
+    # values that were not searched stay exact
     values = [float(f"{v:.{WRITTEN}g}") + 0.0 if k in free else float(near[k]) for k, v in enumerate(found.v)]
     return OperatingPoint(tuple(values[:n_x]), tuple(values[n_x:]), tuple(w.tolist()))
 

@@ -49,7 +49,7 @@ QUIET = 1e-4
 STARTS = 32
 """Starts of the search for equilibria."""
 REACHED = 0.01
-"""Largest deviation of a state from a set-point that counts as held, over the state's size."""
+"""Largest deviation of a state from a set-point that is still regarded as held, over the state's size."""
 ANSWER = 10
 """Periods of the plant's response to a step of an input that is compared with the prior's."""
 
@@ -153,8 +153,8 @@ def preflight(
         tuple(f"scenario {scenario.name}: {text}" for text in texts)
         for texts in (report.problems, report.warnings)
     )
-    told, doubts = warnings[:n_warnings], warnings[n_warnings:]
-    return Preflight(scenario, prior, problems, told, doubts, rest, dataset, tasks)
+    general, doubts = warnings[:n_warnings], warnings[n_warnings:]
+    return Preflight(scenario, prior, problems, general, doubts, rest, dataset, tasks)
 
 
 def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
@@ -165,7 +165,7 @@ def _default_tasks(report: Report, scenario: Scenario) -> tuple[Task, ...]:
         try:
             return default_tasks(scenario)
         except InputError as none:
-            report.warn(f"tasks: none are given, so no loop will run: {str(none).partition(': ')[2]}")
+            report.warn(f"tasks: none given, so no closed loop will run: {str(none).partition(': ')[2]}")
     return ()
 
 
@@ -194,10 +194,10 @@ def _check_rest(report: Report, scenario: Scenario, prior: Prior) -> tuple[Rest 
     found = _equilibria(prior, model, x, u)
     # most equilibria that are listed; more are usually a continuum
     if prior.operating_point is None and 1 < len(found) <= 6:
-        told = "; ".join(f"x = {(p.x.round(6) + 0.0).tolist()} ({p.stability})" for p in found)
+        points = "; ".join(f"x = {(p.x.round(6) + 0.0).tolist()} ({p.stability})" for p in found)
         report.warn(
-            f"prior: several equilibria under u = {u.tolist()}: {told}. Give the one at which the machine works: "
-            "operating_point = OperatingPoint(x=(...), u=(...)). Until then the middle of the signals' ranges is used"
+            f"prior: several equilibria under u = {u.tolist()}: {points}. Give the operating point of the machine: "
+            "operating_point = OperatingPoint(x=(...), u=(...)). Without it, the middle of the signals' ranges is used"
         )
     return Rest(x, u, w, modes, substeps, found), model
 
@@ -207,7 +207,7 @@ def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
         x, u, _ = rest_of(prior)
         report.add(
             f"prior: operating_point is not an equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}. "
-            f"{both_ways(prior)}. Write one of them into operating_point [HM-CHECK-015]"
+            f"{both_ways(prior)}. Write one of these pairs into operating_point [HM-CHECK-015]"
         )
 
 
@@ -251,8 +251,8 @@ def _check_recordings(
     for file, sampling in zip(dataset.files, dataset.sampling, strict=True):
         if sampling > COARSE * spec.dt:
             report.warn(
-                f"recordings: {file} is sampled every {sampling:.3g} s, but the model's period is {spec.dt:g} s, so "
-                "samples between are interpolated. Raise dt in the DataSpec, or record faster"
+                f"recordings: {file} is sampled every {sampling:.3g} s, but the model period is {spec.dt:g} s, so "
+                "samples in between are interpolated. Raise dt in the DataSpec, or record faster"
             )
     train = dataset.by_role("train")
     free = sum(not p.fixed for p in prior.parameters)
@@ -271,8 +271,8 @@ def _check_recordings(
                 beyond = max(low - value, value - high)
                 if beyond > 0.5 * (high - low) and not signal.periodic:
                     report.warn(
-                        f"recordings: {signal.label} ranges from {low:.4g} to {high:.4g}, but at the operating point "
-                        f"it is {value:.4g}. Record there, or correct the operating point or a unit"
+                        f"recordings: {signal.label} ranges from {low:.4g} to {high:.4g}, but is {value:.4g} at the "
+                        "operating point. Record at the operating point, or correct this point or a unit"
                     )
     return dataset
 
@@ -294,11 +294,11 @@ def _each_once(found: Sequence[str], known: Sequence[str]) -> list[str]:
         file, _, text = problem.removeprefix("recordings: ").partition(": ")
         of_file = problem.startswith("recordings: ") and text and Path(file).suffix
         files.setdefault(text if of_file else problem, []).append(file if of_file else "")
-    told = {problem.removeprefix("data: ") for problem in known}
+    reported = {problem.removeprefix("data: ") for problem in known}
     each = []
     for text, (first, *others) in files.items():
         more = f" and {counted(len(others), 'more file')}" if others else ""
-        if text not in told:
+        if text not in reported:
             each.append(f"recordings: {first}{more}: {text}" if first else text)
     return each
 
@@ -335,9 +335,7 @@ def _check_control(
     control = scenario.control
     if control is None:
         if scenario.tasks:
-            report.add(
-                "tasks: no control problem is given to run them. Give control=OCP(...). [HM-CHECK-018]"
-            )
+            report.add("tasks: the scenario has no control problem. Give control=OCP(...). [HM-CHECK-018]")
         return
     before = len(report.problems)
     _check_sensors(report, scenario, prior)
@@ -406,7 +404,7 @@ def _check_problem(
         controller = make_controller(model, model, control)
     if len(report.problems) > before:
         return
-    with report.part(f"{what}: a period of the loop"):
+    with report.part(f"{what}: one period of the loop"):
         loop = Loop(estimator, controller)
         y = model.output(rest.x, rest.u, rest.w, model.p).full().ravel()
         loop.start(y)
@@ -481,13 +479,13 @@ def _check_answer(report: Report, plant: Plant, model: HybridModel, rest: Rest) 
         lengths = float(np.linalg.norm(own)), float(np.linalg.norm(expected))
         # cosine between the responses of plant and prior below which they have different directions
         if min(lengths) > 0 and float(own @ expected) < -0.3 * lengths[0] * lengths[1]:
-            told = ", ".join(
+            moves = ", ".join(
                 f"{s.name} by {a * k:.3g} and {b * k:.3g} {s.unit}"
                 for s, a, b, k in zip(model.states, own, expected, sizes, strict=True)
             )
             report.warn(
                 f"plant: a step of {signal.label} by {steps[j]:g} moves plant and prior in different directions within "
-                f"{ANSWER} periods: {told}. Check signs and units in both"
+                f"{ANSWER} periods: {moves}. Check signs and units in both"
             )
 
 
@@ -547,7 +545,7 @@ def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal])
             k = int(np.argmax(beyond))
             raise InputError(
                 f"{name}: {signal.label} is {values[k, j]:g} at {t[k]:g} s, outside its range {signal.lower:g} to "
-                f"{signal.upper:g}. Correct its unit, or the bounds of the signal. [HM-CHECK-031]"
+                f"{signal.upper:g}. Correct the value or its unit, or the bounds of the signal. [HM-CHECK-031]"
             )
 
 
@@ -583,7 +581,7 @@ def _check_set_point(
     nearest, what = found.y, "y" if by_output else "x"
     if (np.abs(nearest - target)[tied] / wanted[tied] > REACHED).any():
         report.warn(
-            f"task {task.name}: the reference ends at {what} = {target.round(6).tolist()}, which no input within its "
-            f"limits can hold; the nearest steady state is {what} = {(nearest.round(4) + 0.0).tolist()} under "
-            f"u = {found.v[n_x:].round(4).tolist()}"
+            f"task {task.name}: the reference ends at {what} = {target.round(6).tolist()}, but no input within its "
+            f"limits can hold this value; the nearest steady state is {what} = {(nearest.round(4) + 0.0).tolist()} "
+            f"under u = {found.v[n_x:].round(4).tolist()}"
         )

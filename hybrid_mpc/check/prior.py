@@ -43,10 +43,13 @@ NO_TIME = (
     "disturbances, w.<name> in the equations"
 )
 NO_DAE = (
-    ". Algebraic variables are not supported: substitute their equations where they are used, or give them fast rates "
-    "of their own"
+    ". Algebraic variables are not supported: substitute their equations, or make each variable a state with a fast "
+    "rate"
 )
-FINITE = ". It must be finite within the signals' ranges. Keep roots, logarithms and divisions away from singularities"
+FINITE = (
+    ". It must be finite within the signals' ranges. Keep the arguments of roots and logarithms, and denominators, "
+    "away from zero"
+)
 TOO_FEW = "HM-MACHINE-016"
 """Code of the error that equations give another number of values than there are signals."""
 IF = "Cannot compute the truth value"
@@ -54,7 +57,7 @@ IF = "Cannot compute the truth value"
 NUMBER = ("must be real number", "float() argument", "to_int not defined", "loop of ufunc")
 """Messages of functions that expect a number and get an expression."""
 NO_NUMBERS = (
-    ". Write ca.sin(x), ca.sqrt(x) ... instead of functions of math and float(), which accept only numbers"
+    ". Write ca.sin(x), ca.sqrt(x) ... instead of functions of math or float(): they accept only numbers"
 )
 
 
@@ -203,7 +206,8 @@ def _make(report: Report, make: Callable[..., Prior]) -> Prior | None:
         found = make()
         if not isinstance(found, Prior):
             raise InputError(
-                f"must make a hybrid_mpc Prior, e.g. prior=MyPrior, but makes a {type(found).__name__} [HM-CHECK-032]"
+                f"must create a hybrid_mpc Prior, e.g. prior=MyPrior, but creates a {type(found).__name__} "
+                "[HM-CHECK-032]"
             )
         prior = found
     if prior is not None:
@@ -211,7 +215,7 @@ def _make(report: Report, make: Callable[..., Prior]) -> Prior | None:
             again = make(dict(prior.values))
             if again.values != prior.values:
                 raise InputError(
-                    f"prior(values) must use its values, but {prior.values} became {again.values} [HM-CHECK-033]"
+                    f"prior(values) must use the given values, but {prior.values} became {again.values} [HM-CHECK-033]"
                 )
     return prior
 
@@ -251,7 +255,7 @@ def _check_attributes(report: Report, prior: Prior) -> None:
     if isinstance(prior, MechanicalPrior) and "xdot" not in prior.methods and kind.xdot is not Prior.xdot:
         report.add(
             f"prior: {kind.__name__}.xdot is never called: the rates of a MechanicalPrior come from "
-            f"{', '.join(list(prior.methods)[:4])}. Write these, or derive from Prior. [HM-CHECK-039]"
+            f"{', '.join(list(prior.methods)[:4])}. Define these methods, or derive from Prior. [HM-CHECK-039]"
         )
 
 
@@ -560,16 +564,18 @@ def _check_effects(report: Report, prior: Prior, points: Points) -> None:
             if key != "u":
                 if not there:
                     role = "parameter" if key == "p" else "disturbance"
-                    report.warn(f"prior: no rate and no output depends on the {role} {one.label}. Remove it")
+                    report.warn(
+                        f"prior: no rate and no output depends on the {role} {one.label}. Remove this {role}"
+                    )
                 continue
             slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(value, component))])
             if there and slope(*points.columns).full().any():
                 continue
             how = (
-                "only switches: its derivatives are zero everywhere. Inputs that are integers, or on and off, are not "
-                "supported. Use a continuous input such as a duty cycle"
+                "acts only as a switch: its derivatives are zero everywhere. Inputs that are integers, or on and off, "
+                "are not supported. Use a continuous input such as a duty cycle"
                 if there
-                else "changes no rate and no output. Use it in the equations, or remove it"
+                else "changes no rate and no output. Use this input in the equations, or remove it"
             )
             report.add(f"prior: the input {one.label} {how} [HM-CHECK-054]")
 
@@ -593,8 +599,8 @@ def _check_balance(prior: Prior, balance: BalanceEquations, points: Points, rate
     size, k = float(np.max(np.abs([supply, loss, residual]))), int(np.argmax(residual))
     if residual[k] > BALANCE * size:
         raise InputError(
-            f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along the prior's own flow at {points.named(k)}, "
-            "but must be 0. Look for a missing term or a wrong sign. [HM-CHECK-057]"
+            f"{name}: dS/dt - supply + loss is {residual[k]:.3g} along a trajectory of the prior, at "
+            f"{points.named(k)}, but must be 0. Look for a missing term or a wrong sign. [HM-CHECK-057]"
         )
     k = int(np.argmin(loss))
     if loss[k] < -BALANCE * size:

@@ -2,7 +2,7 @@
 
 The first evidence in this order decides, and is given as the reason:
 
-1. copies: a column that is a constant times another, or another one clipped at limits, is no signal of its own;
+1. copies: a column that is a constant times another, or another one clipped at limits, is not a separate signal;
 2. the name: words for a set-point, a command, a sensor (:func:`hybrid_mpc.data.names.role_said_by`);
 3. a set-point: no column affects it, one follows it with gain one, and a third one reacts to it;
 4. values that are held and then jump are commanded; a coarse sensor repeats values, too, but moves by single steps;
@@ -368,7 +368,9 @@ class _Judge:
         self.found[trait.full] = Verdict(kind, reason, sure)
 
     def _copies(self) -> None:
-        """Of two copies, keep the given, else the acting one, else the one whose name says more, else the first."""
+        """Keep one of two copies: the given one, else the acting one, else the one with the clearer name, else the
+        first.
+        """
         if len(self.traits) < 3:  # of only two columns, one is the output even if it equals the other
             return
         for one, other in combinations(self.traits.values(), 2):
@@ -386,12 +388,12 @@ class _Judge:
             else:
                 kept, left, how = (
                     *((other, one) if there else (one, other)),
-                    "{} before it is clipped at limits",
+                    "{} before clipping at limits",
                 )
             if left.full in self.given:
                 kept, left = left, kept
             if left.full not in self.given and len(self.traits) - len(self.of("none")) > 2:
-                self._say(left, "none", f"it is {how.format(repr(kept.full))}")
+                self._say(left, "none", how.format(repr(kept.full)))
                 self.copies.add(left.full)
 
     def _named(self) -> None:
@@ -400,21 +402,21 @@ class _Judge:
             "quantity": "output", "disturbance": "disturbance", "flag": "none", "label": "none",
         }  # fmt: skip
         reasons = {
-            "flag": "by its name a flag; it has few values",
-            "label": "by its name an error, a fault, a correction or a part of a command",
+            "flag": "a flag by its name, with few values",
+            "label": "an error, a fault, a correction or a part of a command by its name",
         }
         for trait in self.open:
             if trait.said in kinds:
                 reason, sure = reasons.get(trait.said, BY_NAME), trait.said != "disturbance"
                 if trait.said == "set-point" and not self._is_followed(trait):
-                    reason, sure = f"{BY_NAME}, but no column follows it: it may be an input", False
+                    reason, sure = f"{BY_NAME}, but no column follows this set-point: may be an input", False
                 self._say(trait, kinds[trait.said], reason, sure)
         # a drive's measurement of its command, or the second of two commands in series
         inputs = [t for t in self.of("input") if t.full not in self.given]
         for one in [t for t in inputs if t.said == "actuator"]:
             for other in [t for t in self.of("input") if t is not one and t.unit == one.unit]:
                 if is_command_of(other.full, one.full) or self._answers_to(one, other):
-                    self._say(one, "none", f"it follows {other.full!r}: the drive's response to it")
+                    self._say(one, "none", f"the drive's response to {other.full!r}")
                     break
 
     def _is_followed(self, goal: Trait) -> bool:
@@ -454,12 +456,12 @@ class _Judge:
             ]  # fmt: skip
             if not drives:
                 continue
-            self._say(goal, "set-point", f"{best.full!r} follows it", False)
+            self._say(goal, "set-point", f"{best.full!r} follows this column", False)
             if best.full not in self.found:
-                self._say(best, "output", f"it follows {goal.full!r}", False)
+                self._say(best, "output", f"follows {goal.full!r}", False)
             drive = max(drives, key=lambda t: t.roughness)
             if drive.full not in self.found and drive.said == "":
-                self._say(drive, "input", f"it reacts to {goal.full!r} and affects {best.full!r}", False)
+                self._say(drive, "input", f"responds to {goal.full!r} and affects {best.full!r}", False)
 
     def _held(self) -> None:
         """Columns that are held and jump, next to others that do not."""
@@ -473,18 +475,18 @@ class _Judge:
             alike = [t for t in commands if "" in (t.unit, trait.unit) or t.unit == trait.unit]
             followed = [t.full for t in alike if self._answers_to(trait, t)]
             if followed:
-                self._say(trait, "none", f"it follows {followed[0]!r}: the drive's response to it", False)
+                self._say(trait, "none", f"the drive's response to {followed[0]!r}", False)
             else:
-                self._say(trait, "input", "it is held and jumps", sure=not named)
+                self._say(trait, "input", "constant between jumps", sure=not named)
         for trait in self.open:
             if trait.is_held:
                 moved = [t for t in [*self.open, *self.of("output")] if t is not trait]
                 moves = (trait.changes != 0).sum() >= SWITCHES and self.links.out_of(trait, moved) >= ACTS
                 if moves or not self.of("input"):
-                    why = "affects other columns" if moves else "is held, and no other column drives"
-                    self._say(trait, "input", f"it is a switch that {why}", False)
+                    why = "affects other columns" if moves else "is the only column that could be an input"
+                    self._say(trait, "input", f"a switch that {why}", False)
                 else:
-                    self._say(trait, "none", "it is a switch without effect: a flag", False)
+                    self._say(trait, "none", "a switch without effect on other columns: a flag", False)
 
     def _by_unit(self) -> None:
         driven = [t for t in self.open if t.unit in DRIVING_UNITS and t.said == "" and t.whole]
@@ -507,7 +509,10 @@ class _Judge:
         if goals and (not free or len(free) + len(self.of("output")) < 2):
             for goal in goals:
                 self._say(
-                    goal, "input", "a set-point, but no other column drives: machine and controller", False
+                    goal,
+                    "input",
+                    "a set-point, but no column acts as an input: the recorded system includes the controller",
+                    False,
                 )
             return
         free = free or [t for t in self.of("output") if t.full not in self.given]
@@ -528,7 +533,7 @@ class _Judge:
             ]  # fmt: skip
             if causes and len(causes) < len(every):
                 for trait in causes:
-                    self._say(trait, "input", "it affects other columns, and none affects it", False)
+                    self._say(trait, "input", "affects other columns, and no column affects this one", False)
                 return
             if any(self.links.out_of(t, every) >= ACTS for t in candidates):
                 roughest = max(candidates, key=lambda t: t.roughness)
@@ -537,19 +542,24 @@ class _Judge:
                     self._say(
                         roughest,
                         "none",
-                        f"it follows {commands[0].full!r}: the drive's response to it",
+                        f"the drive's response to {commands[0].full!r}",
                         False,
                     )
                     roughest = commands[0]
-                self._say(roughest, "input", "columns affect each other, and this one is the roughest", False)
+                self._say(
+                    roughest, "input", "columns affect each other, and this column is the least smooth", False
+                )
                 return
         self._say(
-            candidates[0], "input", "no evidence tells inputs from outputs; it is the first column", False
+            candidates[0],
+            "input",
+            "nothing distinguishes inputs from outputs; this is the first column",
+            False,
         )
 
     def _answers(self) -> None:
         for trait in [t for t in self.open if t.said == "answer"]:
-            self._say(trait, "none", "a drive's measurement of its command")
+            self._say(trait, "none", "the drive's measurement of a command")
 
     def _rest(self) -> None:
         """Other columns are measured: disturbances if nothing affects them and they affect outputs, else outputs."""
@@ -558,9 +568,9 @@ class _Judge:
         for trait in [*self.open, *weak]:
             outputs = [t for t in [*self.open, *self.of("output")] if t is not trait]
             if not outputs or len(outputs) + len(inputs) > MOST_LINKED:
-                self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
+                self.found.setdefault(trait.full, Verdict("output", "not commanded"))
                 continue
-            # a column that no input affects is no output of the machine; angles belong to the machine in any case
+            # a column that no input affects is no output of the machine; an angle is always taken as an output
             strongest = max((self.links.of(trait, t) for t in outputs), default=0.0)
             free = turn_in(trait.unit) is None and all(
                 self.links.of(t, trait) < max(QUIET, strongest / STRONGER) for t in inputs
@@ -574,13 +584,13 @@ class _Judge:
                 alike = next((t.full for t in inputs if known and t.unit == trait.unit), "")
                 if (trait.unit in DRIVING_UNITS or alike) and trait.whole and trait.said == "":
                     unit = (
-                        f"it has the unit of {alike!r}"
-                        if alike
-                        else f"{trait.unit} is a typical unit of inputs"
+                        f"has the unit of {alike!r}" if alike else f"{trait.unit} is a typical unit of inputs"
                     )
-                    self._say(trait, "input", f"it affects outputs, and {unit}", False)
+                    self._say(trait, "input", f"affects outputs, and {unit}", False)
                 else:
-                    self._say(trait, "disturbance", "no input affects it, and it affects outputs", False)
+                    self._say(
+                        trait, "disturbance", "affects outputs, and no input affects this column", False
+                    )
             elif (
                 trait.said == "quantity"
                 and trait.unit in ("degC", "degF", "K")  # of the surroundings
@@ -588,21 +598,26 @@ class _Judge:
                 and any(self.links.into(t, inputs) >= ACTS for t in outputs if t.said != "measured")
             ):
                 # inputs that affect another output would show in this one, too
-                self._say(trait, "disturbance", "no input affects it", False)
+                self._say(trait, "disturbance", "no input affects this column", False)
             elif free and trait.said == "":
-                self._say(trait, "output", "no input affects it; it may be a disturbance instead", False)
+                self._say(trait, "output", "no input affects this column: may be a disturbance", False)
             else:
-                self.found.setdefault(trait.full, Verdict("output", "it is not commanded"))
+                self.found.setdefault(trait.full, Verdict("output", "not commanded"))
 
     def _something(self) -> None:
-        """Ensure one output and one input, if need be against names; copies stay copies."""
+        """Ensure one output and one input, even against names; copies remain excluded."""
         inputs = self.of("input")
         if not self.of("output") and len(inputs) > 1:
             ours = [t for t in inputs if t.full not in self.given]
             ours = [t for t in ours if t.said != "command"] or ours
             if ours:
                 last = max(ours, key=lambda t: self.links.into(t, inputs))
-                self._say(last, "output", "no other column is measured, and the others affect it most", False)
+                self._say(
+                    last,
+                    "output",
+                    "no column is named as measured, and the others affect this column most",
+                    False,
+                )
         spare = [
             t for t in [*self.of("disturbance"), *self.of("set-point"), *self.of("none")]
             if t.full not in self.given and t.full not in self.copies
@@ -612,6 +627,4 @@ class _Judge:
             if not self.of(kind) and spare:
                 trait = next((t for t in spare if t.whole), spare[0])
                 spare.remove(trait)
-                self._say(
-                    trait, kind, f"it is the only column left; its name says {trait.said or 'nothing'}", False
-                )
+                self._say(trait, kind, f"the only column left (role by name: {trait.said or 'none'})", False)

@@ -32,7 +32,7 @@ def analyze(
         list[Path] | None, typer.Option(help="A recording for a frequency response; may be repeated.")
     ] = None,
     speed: Annotated[
-        float | None, typer.Option(help="Size of the motions at which friction is linearized [unit of v].")
+        float | None, typer.Option(help="Amplitude of the speed at which friction is linearized [unit of v].")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of random draws.", min=0, max=MOST_SEED)] = 0,
 ) -> None:

@@ -104,8 +104,8 @@ def _end(left: int, warnings: int, *, recorded: bool) -> str:
     """The last line of a check without errors: what is left to do before a run.
 
     Example:
-        >>> _end(12, 1, recorded=True)
-        "No errors. 12 values are still marked TODO; 1 warning. Look at these, then continue with 'hybrid-mpc run'."
+        >>> _end(2, 1, recorded=True)
+        "No errors. 2 values are still marked TODO; 1 warning. Check these points, then continue with 'hybrid-mpc run'."
         >>> _end(0, 0, recorded=True)
         "No errors; continue with 'hybrid-mpc run'."
     """
@@ -113,7 +113,7 @@ def _end(left: int, warnings: int, *, recorded: bool) -> str:
     todo += [counted(warnings, "warning")] if warnings else []
     if not todo:
         return "No errors; continue with 'hybrid-mpc run'." if recorded else "No errors."
-    then = "Look at these, then continue with 'hybrid-mpc run'." if recorded else "Look at these."
+    then = "Check these points, then continue with 'hybrid-mpc run'." if recorded else "Resolve these points."
     return f"No errors. {'; '.join(todo)}. {then}"
 
 
@@ -165,7 +165,7 @@ def _error(value: float | None) -> str:
 def _free_runs(prior: Prior, found: PriorResult) -> Table:
     length = "" if found.longest_run is None else f" of {found.longest_run:.3g} s"
     columns = [text for s in prior.outputs for text in (f"RMSE {s.label}", f"FIT {s.name} [%]")]
-    table = make_table(f"free runs{length} on the test recordings", "model", "error [spreads]", *columns)
+    table = make_table(f"free runs{length} on the test recordings", "model", "error [-]", *columns)
     names = {"phy_nominal": "prior, nominal", "phy": "prior, fitted"}
     simpler = {name: one.errors for name, one in found.baselines.items()}
     for name, errors in {**found.errors, **simpler}.items():
@@ -199,7 +199,7 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
     console.print(_signals(found, prior, spec))
     if prior.parameters:
         console.print(_parameters(prior))
-    text = "none, so there is no MOPGRNN"
+    text = "none, so no MOPGRNN is trained"
     if not found.problems and prior.equations.balances:
         text = ", ".join(f"{b.name} ({b.unit}, {b.rate_unit})" for b in prior.equations.balances)
     if not found.problems:
@@ -216,7 +216,7 @@ def _tell(console: Console, found: Preflight, spec: DataSpec) -> None:
         if found.default_tasks:
             tasks = f"none given; default tasks: {'; '.join(task.title for task in found.default_tasks)}"
         if scenario.plant is None:
-            tasks += "; loops run on a trained model, since there is no plant"
+            tasks += "; without a plant, loops run on a trained model"
         length = f"{control.horizon} periods, {control.horizon * spec.dt:.4g} s"
         _line(console, "control", f"{length}; tasks: {tasks}")
     if found.dataset is not None:
@@ -277,7 +277,7 @@ def _parameters(prior: Prior) -> Table:
 
 def _rest_lines(prior: Prior, rest: Rest, dt: float) -> list[tuple[str, str]]:
     """The operating point, equilibria and time constants."""
-    origin = "given" if prior.operating_point is not None else "not given, so the middle of the ranges"
+    origin = "given" if prior.operating_point is not None else "not given: middle of the ranges"
     point = ", ".join(
         f"{s.name} = {v:.4g} {s.unit}"
         for signals, values in ((prior.states, rest.x), (prior.inputs, rest.u), (prior.disturbances, rest.w))
@@ -293,7 +293,7 @@ def _rest_lines(prior: Prior, rest: Rest, dt: float) -> list[tuple[str, str]]:
         (f"operating point ({origin})", point),
         ("equilibria under these inputs", (listed + more) or "none found within the ranges"),
         (
-            "time constants there",
+            "time constants at this point",
             f"{_times(rest.modes)}; {rest.substeps} Runge-Kutta steps per period of {dt:g} s",
         ),
     ]

@@ -63,8 +63,10 @@ def control(
     share: Annotated[
         float | None,
         typer.Option(
-            help="Share of the network's correction that blended_observer starts with, between 0 and 2. Default: 1, if "
-            "the hybrid is recommended."
+            help=(
+                "Initial share of the network's correction in blended_observer, from 0 to 2. Default: 1, if the hybrid "
+                "is recommended."
+            )
         ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the loops in an existing folder.")] = False,

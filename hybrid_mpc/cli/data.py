@@ -31,12 +31,13 @@ def data(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="FILE|SCENARIO", help="A recording; or, with --out, a machine with simulated recordings."
+            metavar="FILE|SCENARIO",
+            help=("A recording to inspect; or, with --out, a machine whose recordings to simulate."),
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Folder to create; an existing one must be empty.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the recordings.", min=0, max=MOST_SEED)] = 0,
-    budget: Annotated[str, typer.Option(help="Amount: quick or full.")] = "full",
+    budget: Annotated[str, typer.Option(help="Amount of recordings: quick or full.")] = "full",
     data_set: Annotated[str, typer.Option("--set", help="Data set of a scenario that has several.")] = "",
     plot: Annotated[bool, typer.Option("--plot", help="Open a figure of the recording.")] = False,
 ) -> None:
@@ -78,7 +79,7 @@ def tell(path: Path, plot: bool) -> None:
         words = (one.name, one.unit, str(one.count), one.low, one.high, one.note)
         table.add_row(*(Text(printable(word)) for word in words))
     console.print(table)
-    for title, texts in (("as it was read", found.notes), ("warnings", found.findings)):
+    for title, texts in (("conversions while reading", found.notes), ("warnings", found.findings)):
         if texts:
             console.print(f"\n{title}")
         for text in texts:
@@ -107,7 +108,7 @@ def write_data(scenario: Scenario, out: Path, seed: int, budget: str, data_set: 
             f"{scenario.name} has no budget {budget!r}; it has {', '.join(scenario.budgets)} [HM-CLI-002]"
         )
     if data_set and "data_set" not in inspect.signature(make).parameters:
-        raise InputError(f"{scenario.name} has only one data set. Leave out --set {data_set}. [HM-CLI-003]")
+        raise InputError(f"{scenario.name} has only one data set. Omit --set {data_set}. [HM-CLI-003]")
     from hybrid_mpc.files import check_folder, write_text
 
     check_folder(out)
@@ -142,8 +143,10 @@ def readme(scenario: Scenario, files: Sequence[Path], command: str) -> str:
         "",
         f"Sampling: {time_text(1e3 * period)}, uniform; numpy arrays by these names."
         if arrays
-        else f"Sampling: {time_text(1e3 * period)}; the recorded time stamps jitter by {time_text(1e3 * spread)} "
-        "(one standard deviation). Commas separate cells, points mark decimals, the first row is the header.",
+        else (
+            f"Sampling: {time_text(1e3 * period)}; the recorded time stamps jitter by {time_text(1e3 * spread)} (one "
+            "standard deviation). Cells are separated by commas, decimals by points; the first row is the header."
+        ),
         "",
         f"'hybrid-mpc run' smooths and differentiates the outputs by a local quartic over "
         f"{spec.smoothing:g} s (-3 dB at {band:.1f} Hz) and resamples them to {time_text(1e3 * spec.dt)}.",

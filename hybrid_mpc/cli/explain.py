@@ -35,7 +35,7 @@ def explain(
             help="Law to consider, e.g. coulomb; may be repeated. Default: the scenario's, else all."
         ),
     ] = None,
-    most: Annotated[int, typer.Option(help="Largest number of steps that add terms.", min=1)] = 8,
+    most: Annotated[int, typer.Option(help="Maximum number of steps that add terms.", min=1)] = 8,
     time_column: TimeColumn = "",
     input_column: InputColumns = None,
     output_column: OutputColumns = None,
@@ -78,7 +78,7 @@ def summary(found: ExplainResult, folder: Path) -> list[str]:
     if not explanation.found:
         return [
             *lines, f"no term was added: {explanation.reason}",
-            "no scenario file was written: the prior stays as it is",
+            "no scenario file was written: the prior is unchanged",
         ]  # fmt: skip
     lines += [f"found: {term.name}: {term.formula}" for term in explanation.found]
     return [

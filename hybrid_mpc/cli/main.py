@@ -91,7 +91,7 @@ class Commands(TyperGroup):
 app = typer.Typer(
     name="hybrid-mpc",
     cls=Commands,
-    help="Measurements and an ODE in, a guarded real-time nonlinear MPC out.",
+    help="Turn recordings and a rough ODE into a real-time nonlinear MPC with state observer and fault monitor.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -129,7 +129,7 @@ def _root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Measurements and an ODE in, a guarded real-time nonlinear MPC out."""
+    """Turn recordings and a rough ODE into a real-time nonlinear MPC with state observer and fault monitor."""
 
 
 def main() -> None:
@@ -154,7 +154,9 @@ def main() -> None:
         from hybrid_mpc.files import reason
 
         place = f" {error.filename}" if error.filename is not None else ""
-        errors.print(f"[bold red]error:[/] the file system refused{_escape(place)}: {_escape(reason(error))}")
+        errors.print(
+            f"[bold red]error:[/] a file cannot be read or written{_escape(place)}: {_escape(reason(error))}"
+        )
         _say_what_is_saved(errors)
         sys.exit(BAD_INPUT)
     except SystemExit as stop:

@@ -36,7 +36,7 @@ def monitor(
     learn: Annotated[
         float,
         typer.Option(
-            help="Learn limits from these recordings, which must be nominal, for this many false alarms per hour."
+            help="Learn limits for this many false alarms per hour; the recordings must be nominal."
         ),
     ] = 0.0,
     calibration: Annotated[
@@ -46,13 +46,16 @@ def monitor(
         bool,
         typer.Option(
             "--residuals",
-            help="For a mechanical machine: monitor residuals of outputs and balances instead of the energy.",
+            help="Monitor residuals of outputs and balances instead of the energy (mechanical machine).",
         ),
     ] = False,
     resolution: Annotated[
         list[float] | None,
         typer.Option(
-            help="Resolution of each sensor [its unit], for the test of freezing; may be repeated. Default: from noise."
+            help=(
+                "Resolution of each sensor [its unit] for the frozen-sensor check; may be repeated. Default: from the "
+                "noise."
+            )
         ),
     ] = None,
 ) -> None:
@@ -106,8 +109,8 @@ def watching(job: MonitorJob) -> str:
     if limits is None:
         why = next((text for file, text in job.kit.lacks.items() if file.startswith("watch/")), "")
         return (
-            f"the kit has no limits of {job.kind}{f' ({why})' if why else ''}: the only alarm is a monitor without "
-            "valid readings (see --learn)"
+            f"the kit has no limits of {job.kind}{f' ({why})' if why else ''}: only missing readings raise an alarm. "
+            "Learn limits with --learn"
         )
     channels = ", ".join(dict.fromkeys(one.channel for one in limits.channels))
     return (

@@ -40,7 +40,7 @@ def new(
     lines = [
         *(f"{name}: {note}" for name, notes in draft.notes.items() for note in notes),
         f"time: {draft.time.full if draft.time else 'none found'}, sampled every {draft.sampling}",
-        *([f"  to decide: {draft.doubt}"] if draft.doubt else []),
+        *([f"  decide: {draft.doubt}"] if draft.doubt else []),
         f"inputs: {', '.join(c.full for c in draft.inputs)}",
         f"outputs: {', '.join(c.full for c in draft.outputs)}",
     ]
@@ -49,11 +49,11 @@ def new(
     if draft.set_points:
         lines.append(f"set-points, not used: {', '.join(c.full for c in draft.set_points)}")
     lines += [
-        f"  to decide: check that {name} is {KINDS[draft.verdicts[name].kind]}: {reason}"
+        f"  check that {name} is {KINDS[draft.verdicts[name].kind]}: {reason}"
         for name, reason in draft.unsure.items()
         if draft.verdicts[name].kind in KINDS
     ]
-    lines += [f"  to decide: {line}" for line in loop_lines(draft)]
+    lines += [f"  decide: {line}" for line in loop_lines(draft)]
     lines.append(f"horizon: {horizon_of(draft)[1]}")
     lines += [f"not used: {name} ({reason})" for name, reason in draft.left_out.items()]
     count = len(left_to_decide(path))

@@ -74,20 +74,20 @@ def run(
         typer.Option(help="Run only this stage; may be repeated. Other stages keep their results."),
     ] = None,
     skip: Annotated[
-        list[str] | None, typer.Option(help="Leave out this stage after the export; may be repeated.")
+        list[str] | None, typer.Option(help="Skip this stage after the export; may be repeated.")
     ] = None,
     scheduler: Scheduler = None,
     explain: Annotated[
         bool,
         typer.Option(
-            "--explain", help="First search for terms that the prior lacks, and use a prior with those found."
+            "--explain", help="Search for missing terms first, and use the prior with the found terms."
         ),
     ] = False,
     track: Annotated[
         bool,
         typer.Option(
             "--track",
-            help="Find the parameters that differ between recordings, for an observer that tracks them.",
+            help="Identify parameters that differ between recordings, for an observer that tracks them.",
         ),
     ] = False,
 ) -> None:
@@ -122,7 +122,7 @@ def run(
         results = run_job(
             settings, folder, resume=resume, only=only or (), skip=skip or (), progress=progress, cluster=scheduler,
         )  # fmt: skip
-    lines = ["the run stops here: --only leaves out the later stages"]
+    lines = ["the run stops here, because --only excludes the later stages"]
     print_summary(lines if results is None else summary(results), folder / "report.html", "report")
     if failed := failed_stages(folder):
         for stage, why in failed.items():
@@ -163,7 +163,7 @@ def track_lines(results: Results) -> list[str]:
         return ["tracked parameters: none, since tracking improves no prediction"]
     ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in found.tracking.ratio.items())
     return [
-        f"tracked parameters, with their standard deviations: {names}; errors of predictions over those without "
+        f"tracked parameters, with their standard deviations: {names}; ratio of prediction errors with to without "
         f"tracking: {ratios}",
         *found.tracking.doubts,
     ]
@@ -248,7 +248,7 @@ def watch_lines(found: WatchResult | Absent) -> list[str]:
         >>> watch = WatchResult({"hybrid": WatchFile({"residuals": limits})}, "residuals", faults=(row,))
         >>> print(*watch_lines(watch), sep="\n")
         monitor of residuals: learned from 6.0 min for 2 false alarms per hour; 0 alarms on recordings
-          weak_pump: not detected (alarms before it: 1)
+          weak_pump: not detected (alarms before the fault: 1)
     """
     from hybrid_mpc.workflow.stage import Absent
 
@@ -257,7 +257,7 @@ def watch_lines(found: WatchResult | Absent) -> list[str]:
     limits = found.limits
     rate = f"for {two_digits(limits.false_alarms_per_hour)} false alarms per hour"
     if not limits.rated:
-        rate = "too little to promise a rate of false alarms"
+        rate = "too short to guarantee a false alarm rate"
     lines = [
         f"monitor of {found.kind}: learned from {60 * limits.hours:.1f} min {rate}; "
         f"{counted(len(found.alarms), 'alarm')} on recordings"
@@ -265,7 +265,7 @@ def watch_lines(found: WatchResult | Absent) -> list[str]:
     for row in found.faults or ():
         seen = "not detected" if row.delay_s is None else f"detected after {row.delay_s:.3g} s"
         seen += f" in {row.channels[0]}" if row.channels else ""
-        before = f" (alarms before it: {row.false_alarms})" if row.false_alarms else ""
+        before = f" (alarms before the fault: {row.false_alarms})" if row.false_alarms else ""
         lines.append(f"  {row.fault}: {seen}{before}" + (f": {row.diagnosis}" if row.diagnosis else ""))
     return lines
 

@@ -29,7 +29,7 @@ FAILED = 1
 """Exit code if runs have failed."""
 
 app = typer.Typer(
-    help="Many closed loops from one configuration: run, report, compare.",
+    help="Run, report and compare many closed loops from one configuration.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )

@@ -38,7 +38,7 @@ def tune(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of data, trainings and search.", min=0, max=MOST_SEED)] = 0,
     timeout: Annotated[
-        float | None, typer.Option(help="Start no further training after this time [s]. Default: no limit.")
+        float | None, typer.Option(help="Time after which no further training starts [s]. Default: no limit.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the search in the folder.")] = False,
     time_column: TimeColumn = "",

@@ -134,7 +134,7 @@ class LoopSpec:
             known(self.guard, GUARDS[1:], "guard")
         if self.guard and (self.monitor not in ALARMING or not _is_watched(self.controller)):
             raise InputError(
-                f"guard: it reacts to alarms, so it needs a controller with the hybrid and monitor "
+                "guard: a guard reacts to alarms, so it needs a controller with the hybrid and monitor "
                 f"{' or '.join(ALARMING)}; got controller {self.controller} and monitor {self.monitor} [HM-COMPARE-003]"
             )
         for name in ("faults", "drawn_faults"):
@@ -339,7 +339,7 @@ class Bench:
         others = () if spec.scenario == own else registered_scenarios()
         if spec.scenario in others and load_scenario(spec.scenario).name != own:
             raise InputError(
-                f"loop: it belongs to scenario {spec.scenario}, but the bench has {own}. Make a bench of its scenario "
+                f"loop: belongs to scenario {spec.scenario}, but the bench has {own}. Make a bench of its scenario "
                 "[HM-COMPARE-010]"
             )
         return self.kits[known(spec.model, self.kits, "model on the bench")]
@@ -671,7 +671,7 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
     of = CONTROLLERS[controller].model
     if of == "oracle":
         raise InputError(
-            f"controller {controller}: an oracle needs a plant, but the scenario has none. Leave it out "
+            f"controller {controller}: an oracle needs a plant, but the scenario has none. Omit this controller "
             "[HM-COMPARE-012]"
         )
     held = kit.models.get("hybrid")
@@ -680,8 +680,8 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
         needed = "a hybrid" if of == "prior" else "a network of its training alone"
         raise InputError(
             f"controller {controller}: scenario {kit.name} has no plant, and its kit lacks {needed} to replace it. Run "
-            "the scenario with at least 2 networks (networks of the budget), leave this controller out, or write a "
-            "plant [HM-COMPARE-013]"
+            "the scenario with at least 2 networks (networks of the budget), omit this controller, or write a plant "
+            "[HM-COMPARE-013]"
         )
     own = kit.models[of]
     problem = next(iter(kit.loop.control.values()), None)
@@ -693,8 +693,8 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
     if drawn is None or not moves_otherwise(own, drawn, inputs):
         raise InputError(
             f"controller {controller}: scenario {kit.name} has no plant, and all its models behave like the "
-            "controller's own. The networks correct nothing, and the covariance of the prior's parameters is "
-            "unknown. Leave this controller out, or write a plant [HM-COMPARE-014]"
+            "controller's own. The networks correct nothing, and the covariance of the prior's parameters is unknown. "
+            "Omit this controller, or write a plant [HM-COMPARE-014]"
         )
     return ModelPlant(drawn, kit.sensor_sigma)
 

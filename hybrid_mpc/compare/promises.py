@@ -222,9 +222,9 @@ class Deviation:
     def __str__(self) -> str:
         if not math.isfinite(self.size):
             return f"{self.signal.name} diverges"
-        what = f"{abs(self.offset):.2g} {self.signal.unit} off"
+        what = f"offset {abs(self.offset):.2g} {self.signal.unit}"
         if self.scatter > RESTS * self.sigma:
-            what += f", moving by {self.scatter:.2g} {self.signal.unit}"
+            what += f", varies by {self.scatter:.2g} {self.signal.unit}"
         return f"{self.signal.name} {what} (noise {self.sigma:.2g} {self.signal.unit})"
 
 
@@ -492,7 +492,7 @@ def _explain_failure(point: SetPoint, result: ClosedLoopResult) -> str:
     k, i = (int(own[0]) for own in np.nonzero(~within))
     signal = model.states[i]
     text = (
-        f"{signal.name} is far beyond its range of {signal.lower:g} to {signal.upper:g} {signal.unit} after "
+        f"{signal.name} is far outside its range of {signal.lower:g} to {signal.upper:g} {signal.unit} after "
         f"{k * model.dt:.3g} s"
     )
     failed = np.flatnonzero([source != Source.MPC.name for source in result.source])
@@ -522,8 +522,8 @@ def failing_loop(points: Sequence[SetPoint], every: Sequence[Sequence[Trial]]) -
         return None
     (point, worst), total = failing[0], sum(len(trials) for trials in every)
     evidence = (
-        f"the loop fails in {len(failing)} of {counted(total, 'trial')} with constant loads and parameters up to "
-        f"{100 * OFF:.0f} % off: in {point.title} {worst.fails}"
+        f"the loop fails in {len(failing)} of {counted(total, 'trial')} with constant loads and parameter errors of up "
+        f"to {100 * OFF:.0f} %: in {point.title}, {worst.fails}"
     )
     return Promise("closed loop", "not promised", evidence, _choose_failure_remedy(point, worst))
 
@@ -537,8 +537,8 @@ def _choose_failure_remedy(point: SetPoint, failing: Trial) -> str:
     at = (before >= problem.u_max - edge) | (before <= problem.u_min + edge)
     if ran_away or solved.all() or (at.size and at.mean(axis=0).max() > 0.5):
         return (
-            "The controller's input does not hold the machine against these loads and errors: use set-points farther "
-            "from the limits of the inputs, a stronger actuator, a shorter period, or a better prior."
+            "The inputs cannot compensate these loads and errors. Use set-points farther from the limits of the "
+            "inputs, a stronger actuator, a shorter period, or a better prior."
         )
     finite = "write a prior that is finite beyond the ranges of its states (docs/unstable.md)"
     tenfold = _compute_growth(point)
@@ -574,21 +574,21 @@ def _explain_offset(point: SetPoint, result: ClosedLoopResult, errors: Array) ->
     slowest = float(np.max(np.where(np.isnan(periods), np.inf, periods)))
     if not math.isfinite(slowest):
         return (
-            "the estimated disturbance does not move: the observer explains every load by its process noise"
+            "the estimated disturbance does not change: the observer explains every load by its process noise"
         )
     found = deviations(model.outputs, point.held, point.sigma, errors)
     if all(abs(one.offset) <= NOISE * one.sigma for one in found):
-        return "the loop does not come to rest: noise or friction keeps it moving"
+        return "the loop does not settle: noise or friction excites it"
     half = (len(errors) - late.start) // 2
     d, sizes = result.d[late], LOAD * disturbance_sizes(model, problem)
     moved = np.abs(d[half:].mean(axis=0) - d[:half].mean(axis=0)) / sizes
     if moved.max() > STILL_MOVES or CONSTANTS * slowest > len(errors):
         return f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load has not settled"
     if not problem.n_y and np.any(problem.r > 0) and np.any(np.abs(point.rest[1] - model.u0) > edge):
-        return "the weight r pulls the input to that of the operating point; set r = 0 and weight changes by r_delta"
+        return "the weight r pulls the input towards the operating point; set r = 0 and weight changes by r_delta"
     true = np.array([model.output(x, model.u0, point.w, model.p).full().ravel() for x in result.x[late]])
     if all(float(np.std(true[:, one])) < STANDS * point.sigma[one] for one in point.held):
-        return "the machine is at rest beside its set-point, as with dry friction"
+        return "the machine stands still beside its set-point, as with dry friction"
     return "no disturbance of the model explains the error"
 
 
@@ -623,7 +623,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
     worst = max(trials, key=lambda one: one.worst.size)
     moved = len(trials) - 1 if any(not one.fixed for one in point.model.parameters) else 0
     what = f"{counted(len(trials), 'loop')} with constant loads" + (
-        f", {moved} of them on models with parameters {100 * OFF:.0f} % off," if moved else ""
+        f", {moved} of them on models with parameter errors of {100 * OFF:.0f} %," if moved else ""
     )
     within = f"{len(settled)} of {what} settle within the noise"
     if worst.why:
@@ -1005,7 +1005,8 @@ def tasks_end(ends: Sequence[TaskEnd], where: str) -> Promise:
         return Promise(name, "shown", f"{', '.join(one.task for one in ends)} end within the noise, {where}")
     return Promise(
         name, "doubted", f"{'; '.join(missed)}; {where}",
-        "Look at these loops in the report. Causes: friction, a limit, a slow observer, a load without a disturbance.",
+        "Look at these loops in the report. Possible causes: friction, a limit, a slow observer, a load without a "
+        "disturbance.",
     )  # fmt: skip
 
 
@@ -1058,7 +1059,7 @@ def examine(
     time = step_time([one for one in own if not one.fails] or own, 1e3 * points[0].model.dt)
     of_model = horizon(points), margins(points, _find_prior_points(kit, tasks))
     of_observer = process_noise(kit), innovations(tested)
-    if fails is not None:  # rows about settled loops mean nothing beside it
+    if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer)
     return (
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),

@@ -72,12 +72,12 @@ class Comparison:
 
     @property
     def finding(self) -> str:
-        """``"cheaper"``, ``"dearer"``, ``"the same"`` (interval within 2 % of 1), or ``"undecided"``."""
+        """``"cheaper"``, ``"more expensive"``, ``"the same"`` (interval within 2 % of 1), or ``"undecided"``."""
         if self.low is None or self.high is None:
             return "undecided"
         if self.low > 1.0 - SAME and self.high < 1.0 + SAME:
             return "the same"
-        return "cheaper" if self.high < 1.0 else "dearer" if self.low > 1.0 else "undecided"
+        return "cheaper" if self.high < 1.0 else "more expensive" if self.low > 1.0 else "undecided"
 
     @property
     def decided(self) -> bool:

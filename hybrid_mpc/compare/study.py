@@ -374,13 +374,13 @@ oracle, oracle_state
         oracles = [name for name in self.controllers if name in ORACLES]
         if oracles and set(self.solvers) != {"rti"}:
             raise InputError(
-                f"study: controller {oracles[0]} has a solver of its own (several starts). Remove it, or solvers"
-                " [HM-COMPARE-030]"
+                f"study: controller {oracles[0]} always uses its own solver (several starts). Remove this controller, "
+                "or solvers [HM-COMPARE-030]"
             )
         if oracles and self.vary:
             raise InputError(
-                f"study: controller {oracles[0]} knows the nominal plant, not the varied one. Remove it, or vary"
-                " [HM-COMPARE-031]"
+                f"study: controller {oracles[0]} knows the nominal plant, not the varied one. Remove this controller, "
+                "or vary [HM-COMPARE-031]"
             )
         if self.draws > 1 and not self.vary and self.random_faults is None:
             raise InputError(

@@ -290,7 +290,7 @@ def write_study_report(results: StudyResults, path: str | Path | None = None) ->
 
 def _build_report(results: StudyResults, folder: Path) -> Report:
     study, note = results.note.study, results.note
-    costs = _make_table(results.summary(), "cost: mean, ends of the 95 % interval, runs left out.")
+    costs = _make_table(results.summary(), "cost: mean, 95 % interval, number of excluded runs.")
     sections = [
         _describe_study(results),
         Section("Costs", COST_TEXT, _figure(_distributions, results, folder), [costs]),
@@ -401,7 +401,7 @@ def _tracking(results: StudyResults, folder: Path) -> list[Section]:
         if not (found["n"] > 0).any():
             continue
         tables.append(
-            _make_table(found[found["n"] > 0], f"{label}: mean, ends of the 95 % interval, runs left out.")
+            _make_table(found[found["n"] > 0], f"{label}: mean, 95 % interval, number of excluded runs.")
         )
         values = {
             task: {str(k): g[column].to_numpy() for k, g in rows} for task, rows in _group_levels(results)
@@ -419,7 +419,7 @@ def _task_figures(results: StudyResults) -> list[Section]:
         found = found[found["n"] > 0]
         if len(found):
             tables.append(_make_table(found, f"{name.removeprefix('task_')}: mean."))
-    return [Section("The tasks' own figures", (), (), tables)] if tables else []
+    return [Section("Figures of the tasks", (), (), tables)] if tables else []
 
 
 def _failures(results: StudyResults) -> list[Section]:

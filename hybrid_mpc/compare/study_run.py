@@ -108,8 +108,7 @@ def load_models(
     selected_tasks(scenario, study.tasks)
     if scenario.oracle is None and (oracles := [c for c in study.controllers if c in ORACLES]):
         raise InputError(
-            f"controller {oracles[0]}: scenario {scenario.name} has no oracle. Leave this controller out "
-            "[HM-COMPARE-055]"
+            f"controller {oracles[0]}: scenario {scenario.name} has no oracle. Omit this controller [HM-COMPARE-055]"
         )
     found = {}
     for label, given in study.folders.items():

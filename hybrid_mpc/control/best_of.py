@@ -51,7 +51,7 @@ class BestOf(Controller):
         ocp = controller.ocp
         if most is not None and most < 1:
             raise InputError(
-                f"most: must be at least 1, got {most}. Leave it out to use all starts. [HM-CONTROL-001]"
+                f"most: must be at least 1, got {most}. Omit most to use all starts. [HM-CONTROL-001]"
             )
         for rival in rivals:
             given = rival.ocp.n_x, rival.ocp.n_u, rival.ocp.horizon

@@ -103,9 +103,9 @@ def shortest_move(
     while not reaches(most):
         if most >= longest:
             raise InputError(
-                f"target: no move of {longest} periods ({longest * model.dt:g} s) ends in it; the longest one "
-                f"misses {_missed(plans[most])}. Give a wider target, wider limits, or a larger longest."
-                " [HM-CONTROL-006]"
+                f"target: no move of up to {longest} periods ({longest * model.dt:g} s) ends in the target; the "
+                f"longest move misses {_missed(plans[most])}. Give a wider target, wider limits, or a larger longest. "
+                "[HM-CONTROL-006]"
             )
         least, most = most, min(2 * most, longest)
     while most - least > 1:

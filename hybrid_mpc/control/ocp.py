@@ -475,9 +475,7 @@ def _stage_cost(value: ca.Function | None) -> ca.Function | None:
 def _largest_change(value: ArrayLike, n_u: int) -> Array:
     found = vector(numbers(value, "du_max", most=LARGEST), n_u, "du_max")
     if not np.all(found > 0):
-        raise InputError(
-            f"du_max: must be positive, got {found}. Leave it out for no limit. [HM-CONTROL-018]"
-        )
+        raise InputError(f"du_max: must be positive, got {found}. Omit du_max for no limit. [HM-CONTROL-018]")
     return found
 
 
@@ -520,8 +518,8 @@ def _change_weights(values: ArrayLike, r: Array) -> Array:
     array = _weights(vector(values, r.size, "r_delta"), "r_delta")
     if not np.all(r + array > 0):
         raise InputError(
-            "r, r_delta: every input needs a positive weight in one of them; otherwise it is undetermined"
-            " [HM-CONTROL-023]"
+            "r, r_delta: every input needs a positive weight in r or r_delta; otherwise the input is undetermined "
+            "[HM-CONTROL-023]"
         )
     return array
 

@@ -206,7 +206,7 @@ class BoundRows:
         kept = {self.names[row] for row in np.flatnonzero(self.hard & ~out)}
         if lost := {self.names[row] for row in np.flatnonzero(out)} - kept:
             raise UnreachedBound(
-                f"hard bound on {', '.join(sorted(lost))}: no input of the plan affects it. Bound a value that "
+                f"hard bound on {', '.join(sorted(lost))}: no input of the plan affects this value. Bound a value that "
                 "inputs change within the horizon. [HM-CONTROL-030]"
             )
         return np.where(out, -np.inf, lower), np.where(out, np.inf, upper)
@@ -367,8 +367,8 @@ def _violations(
         np.isnan(found) & (np.isfinite(lower) | np.isfinite(upper)) & ~np.asarray(other)
     ).tolist():
         raise InputError(
-            f"{what}: the size of value {lost[0]} is unknown, since nothing moves it at the operating point. Give both "
-            "of its bounds. [HM-CONTROL-032]"
+            f"{what}: the size of value {lost[0]} is unknown, since nothing affects this value at the operating point. "
+            "Give both of its bounds. [HM-CONTROL-032]"
         )
     return np.where(np.isnan(found), 1.0, found)  # unbounded values, or units that do not matter
 

@@ -56,9 +56,9 @@ class Sizes:
         if np.any(np.isnan(size)):
             names = ", ".join(model.states[i].name for i in np.flatnonzero(np.isnan(size)))
             raise InputError(
-                f"control problem: the size of {names} is unknown: no weight in q, no range, no recordings, and "
-                f"nothing moves it. Give the signal a range: Signal({names.split(',')[0]!r}, unit, lower, upper)"
-                " [HM-CONTROL-043]"
+                f"control problem: the size of {names} is unknown: no weight in q, no range, no recordings, and no "
+                f"input affects it. Give the signal a range: Signal({names.split(',')[0]!r}, unit, lower, upper) "
+                "[HM-CONTROL-043]"
             )
         self.states: Array = size
         """Sizes of the states ``(n_x,)``."""

@@ -30,9 +30,9 @@ class Targets:
     """Steady states for set-points of outputs: ``y_ref`` to ``(x_ref, u_ref)``.
 
     It solves ``min |y - y_ref|^2``, weighted by ``q_y``, over steady states ``z = F(z, u, w, d)`` with inputs, states
-    and outputs within the problem's bounds and the signals' ranges. Of several equally good inputs the one closest to
-    the operating point's is taken, in the inputs' scales. For an unreachable set-point the closest reachable one is
-    returned, with ``reached`` False. If no steady state keeps the bounds of states and outputs, these are ignored.
+    and outputs within the problem's bounds and the signals' ranges. Among equally good inputs, the input closest to
+    that of the operating point is used, in the inputs' scales. For an unreachable set-point the closest reachable one
+    is returned, with ``reached`` False. If no steady state keeps the bounds of states and outputs, these are ignored.
 
     The search is :class:`~hybrid_mpc.model.equilibrium.SteadySearch`, from the given start. Without a start, or if
     Newton's method does not contract from it, set-point and disturbances are continued from the operating point in
@@ -124,7 +124,7 @@ class Targets:
         goal = np.asarray(y_ref, dtype=float).ravel()
         if goal.size != m.n_y or not np.all(np.isfinite(goal[self._tracked])):
             raise InputError(
-                f"y_ref: must have {m.n_y} outputs, finite where q_y weighs them, got {goal} [HM-CONTROL-055]"
+                f"y_ref: must have {m.n_y} outputs, finite for weighted outputs, got {goal} [HM-CONTROL-055]"
             )
         d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
         w = m.w if w is None else vector(w, m.n_w, "w")

@@ -90,7 +90,9 @@ def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
         values = np.where(blank, np.nan, since / 1e9)
         return Cells(values, blank, "s", f"dates read as seconds since {begin}" if kind == "M" else "")
     if kind == "c":
-        return Cells(np.full(len(column), np.nan), none, fault="it holds complex numbers. Write real numbers")
+        return Cells(
+            np.full(len(column), np.nan), none, fault="the cells are complex numbers. Write real numbers"
+        )
     first = [one for one in column.iloc[:SEEN] if isinstance(one, str)]
     texts = len(first) == min(SEEN, len(column)) > 0
     if texts and all(map(ISO.fullmatch, first)):
@@ -108,7 +110,7 @@ def cells_of(column: pd.Series, decimal: str = ".") -> Cells:
         found = found._replace(blank=none)
     values, done = found.values, found.done
     if done == TIMES and (turned := np.cumsum(np.r_[0, np.diff(values) < -DAY / 2])).any():
-        values, done = values + DAY * turned, f"{done}, past midnight {turned[-1]} times"
+        values, done = values + DAY * turned, f"{done}, continued over midnight ({turned[-1]} times)"
     return found._replace(values=values, done=done)
 
 
@@ -162,13 +164,13 @@ def is_unit(cell: str) -> bool:
 def cause(cell: str) -> str:
     """Why a cell is not a number, and what to write instead; empty if the cause is unknown."""
     if THOUSANDS.fullmatch(cell):
-        return "the number has a mark between thousands. Delete the mark and write a decimal point"
+        return "the number has a thousands separator. Delete the separator and write a decimal point"
     if re.fullmatch(r"[+-]?\d*,\d+", cell):
         return "the number has a decimal comma. Write a decimal point, or separate cells by semicolons"
     if is_stamp(cell):
-        return "the cell is a date or a time of day, and other cells are not. Write all rows of the column in one way"
+        return "the cell is a date or a time of day, but other cells are not. Write all rows in one format"
     if cell.casefold() in SWITCH:
-        return "the cell is a word for a switch. Write 1 and 0"
+        return "the cell is a word such as on or true. Write 1 or 0"
     if found := WITH_UNIT.fullmatch(cell):
         unit = found["unit"].strip()
         return (
@@ -235,16 +237,16 @@ def _with_units(words: Sequence[str], others: Array, decimal: str) -> Cells | No
 
 
 def _thousands(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
-    """Numbers with a mark between thousands that cannot be the decimal mark."""
+    """Numbers with a thousands separator that cannot be the decimal mark."""
     mark = "." if decimal == "," else ","
     sure = re.compile(rf"[+-]?\d{{1,3}}(?:([{mark}'’ \u00a0\u202f])\d{{3}})(?:\1\d{{3}})*(?:[{decimal}]\d*)?")
-    # a mark is surely between thousands if a cell has two of them, or one and a decimal mark
-    told = any(mark not in word or word.count(mark) > 1 or decimal in word for word in words)
-    if not told or not all(map(sure.fullmatch, words)):
+    # a mark must be a thousands separator if a cell has two of them, or one and a decimal mark
+    certain = any(mark not in word or word.count(mark) > 1 or decimal in word for word in words)
+    if not certain or not all(map(sure.fullmatch, words)):
         return None
     bare = [re.sub(rf"[{mark}'’ \u00a0\u202f]", "", word) for word in words]
     values = np.array([number(_pointed(one, decimal)) for one in bare])
-    return Cells(values, done="marks between thousands left out")
+    return Cells(values, done="thousands separators removed")
 
 
 # Dates
@@ -271,7 +273,9 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     if "ap" in parts and parts["ap"].notna().any():
         if parts["ap"].isna().any() or (hours > 12).any() or (hours < 1).any():
             return Cells(
-                np.full(len(words), np.nan), none > 0, fault="AM and PM do not fit all cells. Write 24 hours"
+                np.full(len(words), np.nan),
+                none > 0,
+                fault="AM and PM do not fit all cells. Write 24-hour times",
             )
         hours = hours % 12 + 12 * parts["ap"].str.upper().str.startswith("P").to_numpy()
     fraction = none
@@ -285,19 +289,19 @@ def _stamps(words: Sequence[str], others: Array, decimal: str) -> Cells | None:
     if pattern is TIME_OF_DAY:
         if parts["S"].notna().any():
             return Cells(within / 1e9, none > 0, "s", TIMES)
-        fault = "either hours and minutes, or minutes and seconds. Write hours, minutes and seconds"
+        fault = "may be hours and minutes, or minutes and seconds. Write hours, minutes and seconds"
     elif (offsets := _zone(parts)) is None:
-        fault = "time zones have different names. Write the offset, e.g. +02:00"
+        fault = "have different time zones. Write the offset, e.g. +02:00"
     else:
         zone, ways = offsets, _days(parts)
-        fault = "a date does not exist in the calendar. Correct that row" if not ways else ""
+        fault = "do not exist in the calendar. Correct the row" if not ways else ""
     ways = [days * 86400 * 10**9 + within - zone for days in ways]
     if any((np.diff(way) != np.diff(ways[0])).any() for way in ways[1:]):
         ways = [way for way in ways if _goes_on(way)]
         if len(ways) != 1:
-            fault = "day or month may come first. Write year, month and day, e.g. 2024-01-31"
+            fault = "may begin with the day or with the month. Write year, month and day, e.g. 2024-01-31"
     if fault:
-        return Cells(np.full(len(words), np.nan), fault=f"dates such as {words[0]!r}: {fault}")
+        return Cells(np.full(len(words), np.nan), fault=f"dates such as {words[0]!r} {fault}")
     return Cells((ways[0] - ways[0][0]) / 1e9, none > 0, "s", f"dates read as seconds since {words[0]}")
 
 

@@ -295,7 +295,7 @@ def check_excitation(
         >>> check_excitation([run], parameters=2)
         ()
         >>> print(check_excitation([run], parameters=5)[0])
-        input 1 has 1 line (0.5 Hz), 5 parameters of a linear model need 3. Add a multisine, a chirp or steps.
+        input 1 excites 1 frequency (0.5 Hz); 5 parameters of a linear model need 3. Add a multisine, a chirp or steps.
     """
     found, problems = excitation_of(trajectories, inputs), []
     names = ", ".join(dict.fromkeys(piece.file for piece in trajectories))
@@ -304,7 +304,7 @@ def check_excitation(
             level = trajectories[0].u[0, j]
             problems.append(
                 f"{names}: the input {one.name} is constant at {level:.10g}, so its effect cannot be identified. Add a "
-                "recording in which it moves, or check that the DataSpec names the right column. [HM-DATA-021]"
+                "recording in which the input varies, or check that the DataSpec names the right column. [HM-DATA-021]"
             )
     for j in range(trajectories[0].y.shape[1]):
         every = np.concatenate([piece.y[:, j] for piece in trajectories])
@@ -314,8 +314,9 @@ def check_excitation(
         if is_constant(every):
             name = outputs[j].name if j < len(outputs) else f"output {j + 1}"
             problems.append(
-                f"{names}: the output {name} is constant at {every[0]:.10g}: the machine never moved. Excite it beyond "
-                "its friction, or check that the DataSpec names the right column. [HM-DATA-022]"
+                f"{names}: the output {name} is constant at {every[0]:.10g}: the machine never moved. Excite the "
+                "machine with more than its static friction, or check that the DataSpec names the right column. "
+                "[HM-DATA-022]"
             )
     refuse(problems)
     need = -(-parameters // 2)
@@ -334,11 +335,11 @@ def is_constant(values: Array) -> bool:
 
 def _too_few(one: Excitation, parameters: int, need: int) -> str:
     count = len(one.lines)
-    told = ", ".join(f"{f:.3g}" for f in one.lines)
-    lines = f"{counted(count, 'line')} ({told} Hz)" if count else "no line"
+    frequencies = ", ".join(f"{f:.3g}" for f in one.lines)
+    lines = f"{counted(count, 'frequency', 'frequencies')} ({frequencies} Hz)" if count else "no frequency"
     return (
-        f"{one.name} has {lines}, {parameters} parameters of a linear model need {need}. Add a multisine, a chirp or "
-        "steps."
+        f"{one.name} excites {lines}; {parameters} parameters of a linear model need {need}. Add a multisine, a chirp "
+        "or steps."
     )
 
 
@@ -387,7 +388,7 @@ def short_runs(spec: DataSpec, test: Sequence[Trajectory]) -> tuple[str, ...]:
     if not spec.free_run or not test or longest >= 0.95 * spec.free_run:
         return ()
     return (
-        f"DataSpec.free_run is {spec.free_run:g} s, but the longest piece of test data leaves "
-        f"{max(longest, 0.0):.4g} s after its warm-up of {spec.warm_up:g} s: models are evaluated on shorter runs. "
-        "Give longer recordings, or name windows in the DataSpec",
+        f"DataSpec.free_run is {spec.free_run:g} s, but the longest piece of test data leaves {max(longest, 0.0):.4g} "
+        f"s after its warm-up of {spec.warm_up:g} s, so models are evaluated on shorter runs. Give longer recordings, "
+        "or name windows in the DataSpec",
     )

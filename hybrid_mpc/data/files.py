@@ -127,7 +127,7 @@ def _beside(path: Path) -> str:
         near = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in ENDINGS)
     except OSError:
         return ""
-    return f"; its folder holds {', '.join(near[:LISTED])}" if near else ""
+    return f"; its folder contains {', '.join(near[:LISTED])}" if near else ""
 
 
 MOST_DECIMALS = 17  # largest number of decimals: a double has no more

@@ -37,7 +37,7 @@ _CODE = re.compile(
     r"1e\+[1-3]\d|3\.402(82|823|823466)e\+38"
 )
 _NEVER = re.compile(r"9999+(\.9+|\.25)?|999\.25|9\.9.*e\+\d\d+|[13].*e\+[2-9]\d")
-"""Codes that are no position of a switch, if they are negative or larger than ``LARGER``."""
+"""Codes that cannot be the position of a switch if they are negative or larger than ``LARGER``."""
 LARGER = 1e15  # largest number of a machine that switches
 OUTLYING = 10.0  # least distance of an outlier from all other values, in spans of these
 
@@ -47,14 +47,14 @@ NEARLY = 0.25
 SPAN = 1.05
 """Largest span of a wrapped angle in turns: one turn and some noise. An unwrapped angle usually spans more."""
 UNSURE = 0.4
-"""Largest deviation, in turns, of the way over missing samples from the way at the speeds before and after. At half a
-turn another number of turns would fit equally well."""
+"""Largest deviation, in turns, of the motion over missing samples from the motion extrapolated by the speeds before and
+after. At half a turn another number of turns would fit equally well."""
 PARTS = (2, 3, 4, 6, 8)
 """Fractions of a turn at which a sensor may restart: half turns of an arctangent, pole pairs."""
 BITS = (8, 10, 12, 14, 16, 20, 24, 32)  # of counters that overflow
 
 # Stuck sensors
-SHORTEST = 5  # fewest equal consecutive samples of a stuck sensor; fewer are a lost telegram
+SHORTEST = 5  # fewest equal consecutive samples of a stuck sensor; fewer are a lost message
 SPANS = (1, 2, 5)
 """Distances [samples] over which speeds are computed: a sensor's steps hide slow motions in one sample, and fast
 motions end within five."""
@@ -75,10 +75,10 @@ FLICKER = 2.0  # noise, in steps of the sensor, above which the sensor flickers 
 CHANCE = 1e-3  # probability that such noise repeats a value for so long anywhere in the recording
 STIRRED = 0.5
 """Standard deviation of an input within a stretch, over that in all recordings, above which the machine is driven."""
-PATIENCE = 10.0  # longest rest of a driven machine, in longest ordinary times without a change
-LENGTHS = 5.0  # rest that is always allowed, in smoothing lengths: a motion shows in each of them
+PATIENCE = 10.0  # longest standstill of a driven machine, in longest ordinary times without a change
+LENGTHS = 5.0  # standstill that is always allowed, in smoothing lengths
 Kind = Literal["read", "clock", "wrapped", "frozen", "clipped", "speed", "missing", "outlier", "settings"]
-LEAVE_OUT = "Leave out such stretches (by windows in the DataSpec, or delete the rows: longer gaps are cut), or record"
+LEAVE_OUT = "Exclude these samples (by windows in the DataSpec, or by deleting the rows), or record"
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Finding:
 
     @property
     def is_note(self) -> bool:
-        """Whether it says only what was done unambiguously while reading: nothing is doubtful, nothing left to do."""
+        """Whether the finding only reports an unambiguous conversion while reading, with nothing left to decide."""
         return self.kind == "read"
 
     def __str__(self) -> str:
@@ -119,8 +119,8 @@ class Channel:
 
     def finding(self, kind: Kind, first: int, count: int, message: str, refused: bool = False) -> Finding:
         """A finding about ``count`` samples from index ``first`` on."""
-        told = f"column {self.name!r}{message}"
-        return Finding(kind, self.file, self.name, float(self.t[first]), count, told, refused)
+        text = f"column {self.name!r}{message}"
+        return Finding(kind, self.file, self.name, float(self.t[first]), count, text, refused)
 
     def odd(self, there: Mask) -> list[Finding]:
         """Findings of outliers and of rows without a number; ``there`` ``(m,)`` are the rows with a number."""
@@ -128,18 +128,18 @@ class Channel:
         if (far := outliers(y)) is not None:
             rest = np.delete(y, far)
             message = (
-                f" is {y[far[0]]:.6g} {self.signal.unit} at {t[far[0]]:.6g} s: {len(far)} of {len(t)} samples are far "
-                f"from all others, {np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}. Likely causes are a code for a "
-                "missing value or a lost digit. Leave these cells blank, or delete the rows."
+                f" is {y[far[0]]:.6g} {self.signal.unit} at {t[far[0]]:.6g} s; {len(far)} of {len(t)} samples are far "
+                f"from all others ({np.nanmin(rest):.6g} to {np.nanmax(rest):.6g}). Likely causes: a code for a "
+                "missing value, or a lost digit. Leave these cells blank, or delete the rows."
             )
             found.append(self.finding("outlier", far[0], len(far), message))
         if there.any() and not there.all():
             first, count = int(np.argmin(there)), int((~there).sum())
             longest = float(np.diff(np.r_[t[0], t[there], t[-1]]).max())
             message = (
-                f" has no number in {count} of {len(t)} rows ({100 * count / len(t):.3g} %), first at "
-                f"{t[first]:.6g} s; the longest time without a number is {longest:.4g} s. These samples count as "
-                "missing. If they were measured, check the cells."
+                f" has no number in {count} of {len(t)} rows ({100 * count / len(t):.3g} %), first at {t[first]:.6g} "
+                f"s; the longest gap is {longest:.4g} s. Rows without a number count as missing samples. If these "
+                "samples were measured, check the cells."
             )
             found.append(self.finding("missing", first, count, message))
         return found
@@ -153,32 +153,36 @@ class Channel:
         if (turn := turn_in(signal.unit)) is not None:
             angle = unwrap(t, self.y, turn, max_gap, periodic=signal.periodic)
             if len(angle.jumps):
-                told = (
-                    "no smooth motion explains such jumps, so the angle is wrapped. Declare Signal(..., periodic=True) "
-                    f"for {signal.name} in the prior to unwrap it, or record an angle without jumps."
+                text = (
+                    f"the angle is wrapped. To unwrap it, declare Signal(..., periodic=True) for {signal.name} in the "
+                    "prior, or record an angle without jumps."
                 )
                 if signal.periodic:
-                    told = f"the angle is wrapped. {signal.name} is periodic, so the angle was unwrapped."
+                    text = f"the angle is wrapped. {signal.name} is declared periodic, so the angle was unwrapped."
                 if signal.periodic and len(angle.unclear):
-                    told += (
-                        f" Before {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} s) too many samples "
-                        "are missing to count the turns: the recording is cut there."
+                    text += (
+                        f" The recording is cut at {len(angle.unclear)} samples (first at {t[angle.unclear[0]]:.6g} "
+                        "s): too many samples before them are missing, so the turns cannot be counted."
                     )
-                found.append(_jumping(self, angle.jumps, "a full turn", 4, told, not signal.periodic))
+                found.append(_jumping(self, angle.jumps, "a full turn", 4, text, not signal.periodic))
             elif parted := find_folding(t, self.y, turn, max_gap):
                 part = f"1/{parted[0]} of a turn"
-                told = (
+                text = (
                     f"the angle restarts after {part}, or its unit is wrong. {again}{turn / parted[0]:.6g})."
                 )
-                found.append(_jumping(self, parted[1], f"{part} against its motion", 4, told, True))
+                found.append(
+                    _jumping(self, parted[1], f"{part} against the direction of motion", 4, text, True)
+                )
         # integers of b bits span less than 2^b
         if (raw == np.round(raw)).all() and (
             over := _find_restarts(t, raw, [2.0**b for b in BITS], 1 - 1e-10, max_gap)
         ):
             bits = BITS[over[0]]
-            told = f"a counter of {bits} bits overflows. {again}{2**bits})."
+            text = f"a counter of {bits} bits overflows. {again}{2**bits})."
             counts = Channel(self.file, self.name, signal, t, raw)
-            found.append(_jumping(counts, over[1], f"{2**bits} against its motion", 10, told, True))
+            found.append(
+                _jumping(counts, over[1], f"{2**bits} against the direction of motion", 10, text, True)
+            )
         return found, angle if angle is not None and len(angle.jumps) and signal.periodic else None
 
 
@@ -277,7 +281,7 @@ def unwrap(t: Array, angle: Array, turn: float, max_gap: float, *, periodic: boo
         at = np.searchsorted(known, k)
         sides = (
             speed[known[max(at - 1, 0) : at + 1]] * span[k]
-        )  # the way at the speeds before and after the gap
+        )  # motion over the gap at the speed before and after
         turns[k] = np.round((sides.mean() - step[k]) / turn) if len(sides) else 0.0
         off = abs(step[k] + turn * turns[k] - sides.mean()) if len(sides) else math.inf
         if off + np.ptp(sides) > UNSURE * turn:
@@ -324,12 +328,12 @@ def find_folding(t: Array, angle: Array, turn: float, max_gap: float) -> tuple[i
     return found and (PARTS[found[0]], found[1])
 
 
-def _jumping(channel: Channel, jumps: Indices, size: str, digits: int, told: str, refused: bool) -> Finding:
+def _jumping(channel: Channel, jumps: Indices, size: str, digits: int, text: str, refused: bool) -> Finding:
     """The finding about a channel with jumps, from its recorded numbers."""
     y, k, count, unit = channel.y, int(jumps[0]), len(jumps), f" {channel.signal.unit}" * (digits < 10)
     message = (
         f" jumps {counted(count, 'time')} by about {size} (first from {y[k - 1]:.{digits}g} to "
-        f"{y[k]:.{digits}g}{unit} at {channel.t[k]:.6g} s): {told}"
+        f"{y[k]:.{digits}g}{unit} at {channel.t[k]:.6g} s): {text}"
     )
     return channel.finding("wrapped", k, count, message, refused)
 
@@ -374,7 +378,7 @@ def findings_of(
 
 
 def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
-    """Longest rest [s] of a driven machine, from the times between two changes of an output in all recordings."""
+    """Longest standstill [s] of a driven machine, from the times between two changes of an output in all recordings."""
     waits = []
     for recording in recordings:
         known = np.isfinite(recording.y[:, j])
@@ -387,7 +391,7 @@ def _patience(recordings: Sequence[Recording], j: int, spec: DataSpec) -> float:
 
 @dataclass(frozen=True)
 class Still:
-    """Equal consecutive samples, from index ``first`` to ``last``, that are not a rest of the machine.
+    """Equal consecutive samples, from index ``first`` to ``last``, that a standstill of the machine does not explain.
 
     ``"abrupt"``: the stretch begins or ends in full motion; ``"noise"``: the sensor's noise stops as well;
     ``"driven"``: the inputs keep moving. ``amount`` is the speed just before or after [unit/s], the standard deviation
@@ -403,7 +407,7 @@ class Still:
 def still_stretches(
     t: Array, y: Array, u: Array, *, max_gap: float, patience: float, spreads: Array
 ) -> tuple[Still, ...]:
-    """Stretches of equal samples that no rest of the machine explains; a coarse encoder at rest is no such stretch.
+    """Intervals of equal samples that a standstill of the machine does not explain (as it does for a coarse encoder).
 
     ``"abrupt"``: the change of speed at the stretch is ``ABRUPT`` times sharper than any ordinary one. Steps of the
     sensor count as ordinary changes; next to a step of an input any change is allowed. ``"noise"``: a sensor whose
@@ -537,9 +541,10 @@ def _clipped(channel: Channel, first: Still, upper: bool) -> Finding:
     message = (
         f" stays at its {'largest' if upper else 'smallest'} value, {value:.6g} {signal.unit}, for {count} samples, "
         f"first from {t[first.first]:.6g} to {t[first.last]:.6g} s, {_why(first, signal)}. The sensor is clipped, or "
-        f"the machine rests against a stop that the prior does not model. If the sensor's range ends there, declare "
-        f"Signal(..., saturation={ends.replace('inf', 'math.inf')}) for {signal.name}: these samples then count as 'at "
-        f"{'least' if upper else 'most'}'. {LEAVE_OUT} within the sensor's range."
+        "the machine stands at a mechanical stop that the prior does not model. If the sensor's range ends at this "
+        f"value, declare Signal(..., saturation={ends.replace('inf', 'math.inf')}) for {signal.name}: these samples "
+        f"then count as censored (true value at {'least' if upper else 'most'} {value:.6g}). {LEAVE_OUT} within the "
+        "sensor's range."
     )
     return channel.finding("clipped", first.first, count, message)
 
@@ -548,11 +553,11 @@ def _frozen(channel: Channel, still: Sequence[Still]) -> Finding:
     t, signal, others = channel.t, channel.signal, len(still) - 1
     longest = max(still, key=lambda s: t[s.last] - t[s.first])
     count = sum(s.last - s.first + 1 for s in still)
-    more = f" ({others} more such stretch{'es' * (others > 1)}, {count} samples in all)" if others else ""
+    more = f" ({others} more such interval{'s' * (others > 1)}, {count} samples in all)" if others else ""
     message = (
-        f" repeats {channel.y[longest.first]:.6g} {signal.unit} from {t[longest.first]:.6g} to {t[longest.last]:.6g} s,"
-        f" {longest.last - longest.first + 1} samples{more}, {_why(longest, signal)}. "
-        f"The sensor is frozen, telegrams are lost, or the machine is blocked. {LEAVE_OUT} again."
+        f" repeats {channel.y[longest.first]:.6g} {signal.unit} from {t[longest.first]:.6g} to {t[longest.last]:.6g} "
+        f"s, {longest.last - longest.first + 1} samples{more}, {_why(longest, signal)}. The sensor is frozen, messages "
+        f"are lost, or the machine is blocked. {LEAVE_OUT} again."
     )
     return channel.finding("frozen", still[0].first, count, message)
 
@@ -560,12 +565,12 @@ def _frozen(channel: Channel, still: Sequence[Still]) -> Finding:
 def _why(still: Still, signal: Signal) -> str:
     if still.why == "abrupt":
         return (
-            f"although it moves at {still.amount:.3g} {signal.unit}/s just before or after, and such a sharp change of "
-            "speed occurs nowhere else"
+            f"although the speed just before or after is {still.amount:.3g} {signal.unit}/s, and no other change of "
+            "speed is as sharp"
         )
     if still.why == "noise":
-        return f"although its noise elsewhere is {still.amount:.2g} {signal.unit}"
-    return "while the inputs move as elsewhere"
+        return f"although the noise of the sensor is {still.amount:.2g} {signal.unit} at other times"
+    return "while the inputs keep moving"
 
 
 def _too_fast(channel: Channel) -> list[Finding]:
@@ -577,10 +582,10 @@ def _too_fast(channel: Channel) -> list[Finding]:
     worst, mean = int(bad[np.argmax(np.abs(v[bad]))]), float(np.sqrt(np.mean(v**2)))
     absurd = mean > max(abs(speed.lower), abs(speed.upper))
     message = (
-        f", differentiated, reaches {v[worst]:.4g} {speed.unit} at {channel.t[worst]:.6g} s; the plausible range of "
-        f"{speed.name} is {speed.lower:g} to {speed.upper:g} {speed.unit} ({len(bad)} of {len(v)} samples are outside"
-        f"{f', and so is the mean, {mean:.4g} (rms)' if absurd else ''}). The usual cause is a wrong unit (deg for "
-        "rad, rpm, ms for s): name the unit in DataSpec.units. Otherwise look for jumps of the sensor, or widen the "
-        "range in the prior."
+        f": its derivative {speed.name} reaches {v[worst]:.4g} {speed.unit} at {channel.t[worst]:.6g} s, outside the "
+        f"plausible range {speed.lower:g} to {speed.upper:g} {speed.unit} ({len(bad)} of {len(v)} "
+        f"samples{f'; the rms, {mean:.4g}, is outside, too' if absurd else ''}). The usual cause is a wrong unit (deg "
+        "for rad, rpm, ms for s): name the unit in DataSpec.units. Otherwise look for jumps of the sensor, or widen "
+        "the range in the prior."
     )
     return [channel.finding("speed", int(bad[0]), len(bad), message, refused=absurd)]

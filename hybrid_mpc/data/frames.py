@@ -66,7 +66,7 @@ class Frame:
             date = near[0] if clocks[j] and near else None
             if date is not None:
                 taken.add(date)
-                notes.append(f"columns {shown(self.names[date])} and {shown(name)} together are the time")
+                notes.append(f"columns {shown(self.names[date])} and {shown(name)} together give the time")
                 if (gone := _in_seconds(self.names[date])) in header:
                     header.remove(gone)
             elif j in taken:
@@ -109,10 +109,12 @@ class Frame:
         if not len(bad):
             return self.fault(place, one.values).replace("COLUMN", f"column {shown(name)}")
         cell = self.text(int(bad[0]), place)
-        such = f" ({len(bad)} such rows)" if len(bad) > 1 else ""
+        such = f" ({len(bad)} rows in all)" if len(bad) > 1 else ""
         what = f"is {shown(cell)}, not a finite number" if cell else "is empty"
         why = cause(cell)
-        remedy = f": {why}." if why else ". Correct the value or delete the row (longer gaps are cut out)."
+        remedy = (
+            f": {why}." if why else ". Correct the value or delete the row (gaps above max_gap are cut out)."
+        )
         return f"row {self.numbers[int(bad[0])]}, column {shown(name)} {what}{such}{remedy} [HM-DATA-123]"
 
     def in_long_form(self, source: Source) -> Source | None:
@@ -151,7 +153,7 @@ class Frame:
                 at, x = time.values[rows, 0], one.values[rows, 0]
                 order = np.argsort(at, kind="stable")
                 found.append(Series(name, at[order], x[order], one.faults.get(value, "")))
-        note = f"long form: {counted(len(several), 'signal')}, named in column {shown(tags[0])}"
+        note = f"long format: {counted(len(several), 'signal')}, named in column {shown(tags[0])}"
         return replace(clocked(source.path, source.sha256, found, times[0]), notes=(*source.notes, note))
 
     def is_measured(self, name: str) -> bool:

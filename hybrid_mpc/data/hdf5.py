@@ -117,7 +117,7 @@ def _numbers(item: Any, field: str = "") -> NDArray[Any]:
     """Numbers of a dataset, or of one field of its records; the declared size is checked first."""
     if max(8, item.dtype.itemsize) * item.size > budget_of(item.file.id.get_filesize()):
         raise InputError(
-            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than are read from a file of this size"
-            " [HM-DATA-036]"
+            f"{item.name.lstrip('/')} declares {item.shape}, more numbers than a file of this size may hold "
+            "[HM-DATA-036]"
         )
     return np.asarray(item[()][field] if field else item[()])

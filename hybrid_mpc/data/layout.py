@@ -159,8 +159,8 @@ def _headed(
         )
         if width > 2 and body[0].cells in counted:
             return (
-                f"row {number(first)} counts the columns: it may be a header or values. Write a first row with a name "
-                "for each column, e.g. 'time [s]'."
+                f"row {number(first)} numbers the columns: the row may be a header or values. Write a first row with a "
+                "name for each column, e.g. 'time [s]'."
             )
         names = [f"column {j + 1}" if j < spare else "" for j in range(width)]
         notes.append("no header: columns are named by their number")
@@ -169,7 +169,7 @@ def _headed(
         till = number(header) - 1 if header >= 0 else number(first) - 1
         where = f"header in row {number(header)}" if header >= 0 else f"values from row {number(first)} on"
         rows = f"rows 1 to {till} are" if till > 1 else "row 1 is"
-        notes.append(f"{rows} a preamble; {where}")
+        notes.append(f"{rows} a preamble, not read; {where}")
     if units:
         notes.append(f"row {number(first) - 1} is a row of units")
         named = _with_units(names, units)
@@ -235,6 +235,9 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | str:
     for name, cell in zip(names, [*units, *[""] * (len(names) - len(units))], strict=True):
         unit, said = cell.strip("[]()").strip(), name_and_unit(name)[1]
         if said and unit and conversion(said, unit) != Conversion(1.0):
-            return f"column {shown(name)} has the unit {shown(unit)}, but the header says {shown(said)}. Delete one."
+            return (
+                f"column {shown(name)} has the unit {shown(unit)}, but the header says {shown(said)}. Delete one of "
+                "the two units."
+            )
         found.append(f"{name} [{unit}]" if unit not in ("", "-") and not said and name else name)
     return found

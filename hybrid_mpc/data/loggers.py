@@ -79,12 +79,12 @@ def _source(
         last = np.r_[np.diff(t) != 0, True]  # the last of the samples with equal stamps
         twice += int((~last).sum())
         series.append(Series(_named(name, unit), t[last], np.asarray(values, np.float64)[last]))
-    told = f" Not read: {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
+    note = f" Not read: {', '.join(map(shown, unread[:LISTED]))}." if unread else ""
     clocks = len({(len(one.t), *one.t[[0, -1]]) for one in series})
     notes = (*([note] if note else []), f"{counted(len(series), 'signal')}, {counted(clocks, 'clock')}")
     if twice:
-        notes = (*notes, f"{twice} samples are left out: a later sample has the same stamp")
-    return replace(clocked(path, sha256, series, note=told), unread=tuple(unread), notes=notes)
+        notes = (*notes, f"{twice} samples are dropped: a later sample has the same time stamp")
+    return replace(clocked(path, sha256, series, note=note), unread=tuple(unread), notes=notes)
 
 
 # MDF and TDMS
@@ -278,10 +278,10 @@ def _can(path: Path, content: bytes, sha256: str) -> Source:
     near = sorted(path.parent.glob("*.dbc"))
     own = [one for one in near if one.stem == path.stem] or near
     if len(own) != 1:
-        there = f"; its folder holds {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
+        there = f"; its folder contains {', '.join(shown(one.name) for one in near[:LISTED])}" if near else ""
         raise InputError(
-            f"{path}: the database of the CAN messages is missing{there}. Put {path.stem}.dbc beside the log: its "
-            "bytes have no meaning without the database. [HM-DATA-040]"
+            f"{path}: the database of the CAN messages is missing{there}. Put {path.stem}.dbc beside the log; without "
+            "the database the messages cannot be decoded. [HM-DATA-040]"
         )
     base = cantools.database.load_string(own[0].read_text(encoding="cp1252"), "dbc", strict=False)
     known = {message.frame_id: message for message in base.messages}

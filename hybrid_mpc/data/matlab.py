@@ -202,8 +202,8 @@ class _File:
             return
         if kind in (OPAQUE, FUNCTION):
             made_of = data[parts[3].begin : parts[3].end] if len(parts) > 3 else b""
-            told = made_of.decode("ascii", errors="replace") if kind == OPAQUE else "function_handle"
-            yield Leaf(name, what=f"{OBJECTS} of class {told or 'unknown'}", kind=told)
+            name_of_class = made_of.decode("ascii", errors="replace") if kind == OPAQUE else "function_handle"
+            yield Leaf(name, what=f"{OBJECTS} of class {name_of_class or 'unknown'}", kind=name_of_class)
             return
         if parts[1].kind not in (5, 6) or parts[1].size < 8 or parts[1].size % 4:
             raise ValueError("a variable has no dimensions [HM-DATA-057]")

@@ -163,13 +163,13 @@ def read_recordings(
         for name, files in missing.items()
         if name in there
     ):
-        told = "Columns differ between the recordings. Each recording needs the columns named in the DataSpec. Name "
-        problems.insert(0, f"{told}different inputs of single recordings in inputs_of:{differ}")
+        begin = "Columns differ between the recordings. Each recording needs the columns named in the DataSpec. Name "
+        problems.insert(0, f"{begin}the inputs of a recording with other columns in inputs_of:{differ}")
     for i, one in enumerate(recordings):
         if same := next((other for other in recordings[:i] if _alike(one, other)), None):
             problems.append(
-                f"{one.path} holds the same samples as {same.path.name}. Leave one of them out: a recording must not "
-                "count twice. [HM-DATA-064]"
+                f"{one.path} has the same samples as {same.path.name}. Remove one of the two files: a recording must "
+                "not count twice. [HM-DATA-064]"
             )
     stems = [Path(path).stem for path in paths]
     if len(set(stems)) < len(stems):
@@ -272,8 +272,8 @@ def find_misspelt(spec: DataSpec, paths: Sequence[Path]) -> list[Finding]:
             near = difflib.get_close_matches(name, free, n=1, cutoff=ALIKE)
             if near and re.sub(r"\d+", "", name) != re.sub(r"\d+", "", near[0]):
                 message = (
-                    f"{setting} of the DataSpec names {name!r}, but no such recording is given. Did you mean "
-                    f"{near[0]!r}? Settings of recordings are named by the stem of the file."
+                    f"{setting} of the DataSpec names the recording {name!r}, which is not given. Did you mean "
+                    f"{near[0]!r}? A recording is named by the stem of its file."
                 )
                 found.append(Finding("settings", free[near[0]], "", 0.0, 1, message))
     return found
@@ -326,8 +326,8 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
         values = np.column_stack([spec.time * np.arange(len(values)), values])
     columns, values, findings = _one_clock(path.name, columns, values, spec, found[0])
     if source.notes and len(values):
-        told = f"as it was read: {'; '.join(source.notes)}"
-        findings.append(Finding("read", path.name, "", float(values[0, 0]), len(source.notes), told))
+        text = f"conversions while reading: {'; '.join(source.notes)}"
+        findings.append(Finding("read", path.name, "", float(values[0, 0]), len(source.notes), text))
     problems, raw = list(columns.problems), values.copy()
     codes = [None, *map(missing_code, raw.T[1:])]  # before conversion of units
     unclear: set[int] = set()  # columns whose unit cannot be converted to that of their signal
@@ -352,15 +352,15 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
         faulty = any(f"column {shown(found[j])} " in problem for problem in columns.problems)
         if j >= first and len(t) and not there.any() and not faulty:
             problems.append(
-                f"column {name!r} has no number in any row; {signal.name} was not measured. Record it, or leave out "
-                "this recording. [HM-DATA-070]"
+                f"column {name!r} has no number in any row; {signal.name} was not measured. Record this signal, or "
+                "remove this recording. [HM-DATA-070]"
             )
         if clean and j >= split and there.any() and (censored[there, j - split] != 0).all():
             lower, upper = signal.saturation or (-math.inf, math.inf)
             problems.append(
                 f"column {name!r} is at or beyond an end of its sensor's range {lower:g} to {upper:g} {signal.unit} in "
-                f"all rows ({values[there, j].min():.6g} to {values[there, j].max():.6g}): nothing was measured. Check "
-                f"the unit and Signal.saturation of {signal.name}, or leave out this recording. [HM-DATA-071]"
+                f"all rows ({values[there, j].min():.6g} to {values[there, j].max():.6g}), so it has no measured "
+                f"value. Check the unit and Signal.saturation of {signal.name}, or remove this recording. [HM-DATA-071]"
             )
         if clean and j >= first:
             channel = Channel(path.name, name, signal, t[there], values[there, j])
@@ -368,7 +368,7 @@ def _recording(source: Source, spec: DataSpec, found: Sequence[str], prior: Sign
             findings += jumping
             if angle is not None:
                 values[there, j] = angle.angle
-                note = f", with {counted(len(angle.jumps), 'jump')} of a full turn taken out"
+                note = f", with {counted(len(angle.jumps), 'jump')} of a full turn removed"
                 cuts |= set(np.flatnonzero(there)[angle.unclear].tolist())
         channel = Channel(path.name, name, signal, t, values[:, j])
         if clean and j:
@@ -411,9 +411,9 @@ def _range_problems(channel: Channel, columns: Columns, note: str) -> list[str]:
     if not len(bad):
         return []
     first, worst = int(bad[0]), int(bad[np.argmax(np.abs(column[bad]))])
-    such = f" ({len(bad)} such rows, the largest {column[worst]:g} in {columns.place(worst)})"
+    such = f" ({len(bad)} rows in all; the largest is {column[worst]:g} in {columns.place(worst)})"
     unit = _likely_unit(column[~np.isnan(column)], signal)
-    hint = f" In {unit} it would be plausible: write units={{{channel.name!r}: {unit!r}}} in the DataSpec."
+    hint = f" The values are plausible in {unit}: write units={{{channel.name!r}: {unit!r}}} in the DataSpec."
     return [
         f"{columns.place(first)}, column {channel.name!r}: {column[first]:g} is outside the plausible range "
         f"{lower:g} to {upper:g} {signal.unit} of {signal.name}{note}{such if len(bad) > 1 else ''}."
@@ -448,7 +448,10 @@ def _one_clock(
         twice = np.r_[False, (values[1:] == values[:-1]).all(axis=1)][: len(values)]
         if twice.any():
             count = int(twice.sum())
-            what = f"{counted(count, 'row repeats', 'rows repeat')} the previous row, the first is this one; left out."
+            what = (
+                f"{counted(count, 'row repeats', 'rows repeat')} the previous row and are dropped; this row is the "
+                "first."
+            )
             tell(int(np.argmax(twice)), count, what)
             numbers = [columns.numbers[j] for j in np.flatnonzero(~twice).tolist()]
             columns, values = replace(columns, values=columns.values[~twice], numbers=numbers), values[~twice]
@@ -459,9 +462,12 @@ def _one_clock(
         values[a:b, 0] = own if a == 0 else own - own[0] + values[a - 1, 0] + pause
     if begins:
         k, count = begins[0], len(begins)
-        such = f"; {count} such rows" if count > 1 else ""
+        such = f"; {count} restarts in all" if count > 1 else ""
         what = f"time restarts ({t[k - 1]:.10g}, then {t[k]:.10g}{such}): the logger was started again. The "
-        what += f"recording is cut there; its later samples follow from {values[k, 0]:.6g} on. Split the file to give "
+        what += (
+            f"recording is cut there, and its later time stamps are shifted to begin at {values[k, 0]:.6g}. Split the "
+            "file to give "
+        )
         tell(k, count, f"{what}its parts different roles.")
     return columns, values, findings
 
@@ -514,7 +520,7 @@ def _rounding(t: Array) -> Array:
 def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> list[str]:
     """Problems with finite time stamps."""
     if len(t) < 2:
-        return [f"{len(t)} row(s) of numbers are too few for a recording. Record it again. [HM-DATA-119]"]
+        return [f"{len(t)} row(s) of numbers are too few for a recording. Record more samples. [HM-DATA-119]"]
     if disorder := columns.disorder(t, _stamps(spec)):
         return [disorder]
     in_seconds = f"check that {_stamps(spec)} is in seconds (DataSpec.units names another unit)."
@@ -526,8 +532,8 @@ def _time_problems(t: Array, columns: Columns, spec: DataSpec, stem: str) -> lis
         )
     if length < need:
         problems.append(
-            f"{len(t)} samples over {length:g} s are fewer than the {need:g} s that the warm-up ({spec.warm_up:g} s) "
-            f"and {MIN_SCORED} periods need. Give a longer recording, or {in_seconds} [HM-DATA-074]"
+            f"the recording is {length:g} s long ({len(t)} samples), but the warm-up ({spec.warm_up:g} s) and "
+            f"{MIN_SCORED} periods need {need:g} s. Give a longer recording, or {in_seconds} [HM-DATA-074]"
         )
     return problems + [
         f"the {window.role} window {window.start:g} to {window.end:g} s is not within the "

@@ -90,7 +90,7 @@ def _frame_of(path: Path, rows: Sequence[tuple[Any, ...]], layout: Layout, notes
         closing.append(numbers.pop() + 1)
     notes = [*notes, *layout.notes]
     if closing:
-        notes.append(f"rows from {closing[-1]} on are not part of the table and are left out")
+        notes.append(f"rows from {closing[-1]} on are not part of the table and are ignored")
     seen = [j for j, name in enumerate(layout.names) if name]
 
     def cell(k: int, j: int) -> Any:
@@ -131,7 +131,7 @@ def arrow_source(path: Path, content: bytes, sha256: str) -> Source:
         )
         if 8 * rows * max(1, len(names)) > LARGEST:
             raise InputError(
-                f"{path}: {rows} rows are more than are read from one file. Split the recording. [HM-DATA-081]"
+                f"{path}: {rows} rows are more than can be read from one file. Split the recording. [HM-DATA-081]"
             )
         if file is None:
             own = ipc.IpcReadOptions(included_fields=[schema.get_field_index(name) for name in names])

@@ -67,8 +67,8 @@ class Columns:
         k, such = int(np.argmax(wrong)), int(wrong.sum())
         what = "repeats" if t[k] == t[k + 1] else "decreases"
         return (
-            f"{self.place(k + 1)}, {stamps}: time {what} ({t[k]:.10g} s, then {t[k + 1]:.10g} s"
-            f"{f'; {such} such rows' if such > 1 else ''}). Time stamps must increase: delete repeated rows or "
+            f"{self.place(k + 1)}, {stamps}: time {what} ({t[k]:.10g} s, then {t[k + 1]:.10g} "
+            f"s{f'; {such} rows in all' if such > 1 else ''}). Time stamps must increase: delete repeated rows or "
             "split the file into recordings. [HM-DATA-116]"
         )
 
@@ -190,8 +190,8 @@ def clocked(path: Path, sha256: str, series: Sequence[Series], time: str = TIME,
         t = _joined([one.t for one in sound or series if one.name not in found])
         if 8 * len(t) * len(names) > LARGEST:
             raise InputError(
-                f"{path}: {len(names)} signals at {len(t)} stamps are more numbers than are read at once. Name fewer "
-                "signals, or split the recording. [HM-DATA-086]"
+                f"{path}: {len(names)} signals at {len(t)} stamps are more numbers than can be read at once. Name "
+                "fewer signals, or split the recording. [HM-DATA-086]"
             )
         values, first = np.full((len(t), len(names)), np.nan), t[0] if len(t) else 0.0
         for j, name in enumerate(names):

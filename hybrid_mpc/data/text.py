@@ -32,8 +32,8 @@ SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "vertical bar
 SAMPLE = 2**17  # bytes at the beginning of a text in which the table is searched
 BLANKS = sorted({form(cell) for cell in BLANK for form in (str, str.upper, str.capitalize)} | {"NaN"})
 UNCLOSED = (
-    "a quotation mark is not closed, so the rows after it form one cell. Delete the mark, or double it within "
-    "a text."
+    "a quotation mark is not closed, so the rows after it form one cell. Delete the mark, or double a mark within a "
+    "text."
 )
 
 
@@ -169,9 +169,9 @@ class _Rows:
             again = [k for k in np.flatnonzero(like).tolist() if self.line(k) == line]
             keep[again] = False
             if again:
-                notes.append(f"row {self.numbers[again[0]]} repeats the header and is left out")
+                notes.append(f"row {self.numbers[again[0]]} repeats the header and is ignored")
         if remarks.any():
-            notes.append(f"rows of remarks are left out, the first is row {self.numbers[np.argmax(remarks)]}")
+            notes.append(f"rows of remarks are ignored, the first is row {self.numbers[np.argmax(remarks)]}")
         top = self.cells(layout.first) if keep.any() else []
         values, closing = [j for j, cell in enumerate(top) if is_value(cell)], 0
         # most rows behind a table (means, sums, a remark) that are removed
@@ -183,7 +183,7 @@ class _Rows:
                 break
             keep[k], closing = False, k
         if closing:
-            notes.append(f"rows from {self.numbers[closing]} on are not part of the table and are left out")
+            notes.append(f"rows from {self.numbers[closing]} on are not part of the table and are ignored")
         self.check(keep, layout)
         return keep
 
@@ -191,7 +191,7 @@ class _Rows:
         """Refuse rows with another number of cells, and cells that contain whole rows (an unclosed quotation mark)."""
         wrong, header = np.flatnonzero(keep & (self.widths != layout.width)), layout.header
         if len(wrong):
-            k, such = int(wrong[0]), f" ({len(wrong)} such rows)" if len(wrong) > 1 else ""
+            k, such = int(wrong[0]), f" ({len(wrong)} rows in all)" if len(wrong) > 1 else ""
             place = (
                 f"row {self.numbers[layout.first]}"
                 if header < 0
@@ -302,8 +302,8 @@ def _parsed(
             encoding="utf-8",
         )
     except (pd.errors.ParserError, ValueError) as error:
-        told = str(error).strip().splitlines()[0]
-        raise InputError(f"{rows.path}: {told}. Export the table as plain CSV. [HM-DATA-096]") from error
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"{rows.path}: {reason}. Export the table as plain CSV. [HM-DATA-096]") from error
 
 
 def _decimal(path: Path, body: bytes, separator: str) -> tuple[str, str]:
@@ -343,13 +343,13 @@ def _grouped(column: pd.Series, unsure: str, decimal: str, numbers: Sequence[int
         return ""
     whole = texts.str.fullmatch(r"[+-]?\d{1,3}")
     single = texts.str.fullmatch(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
-    told = decimal not in unsure or len(unsure) > 1  # another column shows another mark
-    if not (whole | single | texts.str.casefold().isin(BLANK)).all() or not (whole.any() or told):
+    certain = decimal not in unsure or len(unsure) > 1  # another column shows another mark
+    if not (whole | single | texts.str.casefold().isin(BLANK)).all() or not (whole.any() or certain):
         return ""
     k = int(np.argmax(found.to_numpy()))
     return (
-        f"row {numbers[k]}, COLUMN is {shown(texts.iloc[k])}: the mark may stand between thousands or before decimals. "
-        "Write one decimal mark, equally many decimals in all rows, and no mark between thousands. [HM-DATA-126]"
+        f"row {numbers[k]}, COLUMN is {shown(texts.iloc[k])}: the mark may be a thousands separator or a decimal mark. "
+        "Write one decimal mark, the same number of decimals in all rows, and no thousands separator. [HM-DATA-126]"
     )
 
 

@@ -207,7 +207,7 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
     times, period, number, file = recording.t, recording.dt, 0, recording.path.name
     ends = np.flatnonzero(gaps(times, spec.max_gap))
     for first in recording.cuts:
-        why = "the number of turns of an angle over missing samples is unknown"
+        why = "the number of turns of an angle during missing samples is unknown"
         cuts.append(Cut(file, float(times[first - 1]), float(times[first]), why))
     for k in ends:
         why = f"gap of {times[k + 1] - times[k]:.4g} s is longer than max_gap {spec.max_gap:g} s"
@@ -234,12 +234,12 @@ def _segments(recording: Recording, spec: DataSpec, n_x: int | None, cuts: list[
         if end - start < shortest - NEAR * spec.dt:
             why = _too_short(shortest, spec)
             if t[-1] >= shortest - NEAR * spec.dt:
-                why = f"the time that all columns cover, known delays removed, is {why}"
+                why = f"without the known delays, the time covered by all columns is {why}"
             cuts.append(Cut(file, origin, origin + float(t[-1]), why))
             continue
         for one, two in ((0.0, start), (end, float(t[-1]))):
             if two - one > NEAR * spec.dt:
-                why = "not covered by all columns after known delays are removed"
+                why = "not covered by all columns without the known delays"
                 cuts.append(Cut(file, origin + one, origin + two, why))
         number += 1
         grid: Array = start + spec.dt * np.arange(
@@ -292,12 +292,12 @@ def _check_sampling(recording: Recording, samples: int, spec: DataSpec) -> None:
     if samples * len(recording.t) * mean / recording.dt > 2e10:
         raise InputError(
             f"smoothing of {spec.smoothing:g} s covers {samples} of {len(recording.t)} samples, too many to compute. "
-            f"The model's period is {spec.dt:g} s: keep every tenth or hundredth row, or split the recording. "
+            f"The model period is {spec.dt:g} s: keep every tenth or hundredth row, or split the recording. "
             "[HM-DATA-102]"
         )
     if mean > FINEST * spec.dt:
         raise InputError(
-            f"the model's period of {spec.dt:g} s is more than {FINEST} times finer than the sampling (mean step "
+            f"the model period of {spec.dt:g} s is more than {FINEST} times finer than the sampling (mean step "
             f"{mean:.3g} s). Raise dt in the DataSpec, or check that time is in seconds. [HM-DATA-103]"
         )
 

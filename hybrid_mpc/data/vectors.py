@@ -90,13 +90,13 @@ def vector_source(
                 if time is not None and name == names[0] and array.dtype == np.float16 and array.size > 1:
                     raise InputError(
                         f"{path}: column {shown(name)} has half precision, too coarse for time stamps (three digits). "
-                        "Save it in double precision. [HM-DATA-108]"
+                        "Save the column in double precision. [HM-DATA-108]"
                     )
                 left -= 8 * array.size
                 if left < 0:
                     raise InputError(
-                        f"{path}: the columns take more than {megabytes(budget)} of numbers, the most that is read "
-                        "from a file of this size. Save it uncompressed, or split the recording. [HM-DATA-109]"
+                        f"{path}: the columns take more than {megabytes(budget)} of numbers, the limit for a file of "
+                        "this size. Save the file uncompressed, or split the recording. [HM-DATA-109]"
                     )
                 columns.append(_vector(path, name, array))
             except InputError as error:
@@ -117,7 +117,7 @@ def vector_source(
             if len(bad):
                 found[name] = (
                     f"{row} {bad[0] + first}, column {shown(name)} is {column[bad[0]]:g}, not a finite number "
-                    f"({len(bad)} such). Correct the value or delete the row (longer gaps are cut out). "
+                    f"({len(bad)} in all). Correct the value or delete the row (gaps above max_gap are cut out). "
                     "[HM-DATA-124]"
                 )
         values[~np.isfinite(values)] = np.nan
@@ -130,12 +130,12 @@ def _vector(path: Path, name: str, array: NDArray[Any]) -> Array:
     if array.dtype.kind not in "biuf":
         what = {"c": "complex numbers", "U": "text", "S": "text", "M": "dates"}.get(array.dtype.kind)
         raise InputError(
-            f"{path}: column {shown(name)} holds {what or 'cells or other objects'}, not real numbers. "
-            "Save it as a vector of numbers. [HM-DATA-111]"
+            f"{path}: column {shown(name)} contains {what or 'cells or other objects'}, not real numbers. Save a "
+            "vector of numbers. [HM-DATA-111]"
         )
     if array.size and sum(length != 1 for length in array.shape) > 1:
         raise InputError(
-            f"{path}: column {shown(name)} has shape {array.shape} and is not a vector. Save each of its columns "
+            f"{path}: column {shown(name)} has shape {array.shape} and is not a vector. Save each column of the array "
             "under its own name. [HM-DATA-112]"
         )
     return np.asarray(array, dtype=np.float64).ravel()
@@ -195,9 +195,9 @@ def leaf_source(
             unread.setdefault(leaf.what, []).append(leaf.name)
             if leaf.kind in CONVERT:
                 lines.append(CONVERT[leaf.kind].format(leaf.name, f"{path.stem}_vectors.mat"))
-    told = [f"{what} ({', '.join(map(shown, names[:LISTED]))})" for what, names in sorted(unread.items())]
-    note = f" Not read: {' and '.join(told)}." if told else ""
-    note += f" In MATLAB: {lines[0]}" if lines else " Save their vectors as variables." if told else ""
+    kinds = [f"{what} ({', '.join(map(shown, names[:LISTED]))})" for what, names in sorted(unread.items())]
+    note = f" Not read: {' and '.join(kinds)}." if kinds else ""
+    note += f" In MATLAB: {lines[0]}" if lines else " Save their vectors as variables." if kinds else ""
     lost = tuple(name for names in unread.values() for name in names)
     row, first = ("row", 1) if matlab else ("index", 0)
     budget = budget_of(len(content))
@@ -261,11 +261,11 @@ def _with_clocks(source: Source, lengths: dict[str, int], budget: int) -> Source
     time = f"{own.pop()} [s]" if len(own) == 1 else TIME
     used = ", ".join(map(shown, list(dict.fromkeys(clocks.values()))[:LISTED]))
     lost = [name for name in lengths if name not in clocks]
-    note = f" Without a time of their own: {', '.join(map(shown, lost[:LISTED]))}." if lost else ""
+    note = f" Without time stamps: {', '.join(map(shown, lost[:LISTED]))}." if lost else ""
     return replace(
         clocked(source.path, source.sha256, series, time, source.note + note),
         unread=(*source.unread, *lost),
-        notes=(f"vectors have their own times: {used}",),
+        notes=(f"vectors have different time stamps: {used}",),
     )
 
 

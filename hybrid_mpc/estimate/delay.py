@@ -85,7 +85,7 @@ class DelayCompensation:
         """Estimate one period later, from the arrived measurement and the input decided since."""
         if not isinstance(estimate, DelayedEstimate):
             raise InputError(
-                "DelayCompensation: the estimate is of another filter. Begin with start() of this one. "
+                "DelayCompensation: the estimate is of another filter. Begin with start() of this filter. "
                 "[HM-ESTIMATE-005]"
             )
         base, y = estimate.filtered, sampled(y, (None,), "y")

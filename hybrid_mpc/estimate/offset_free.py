@@ -63,7 +63,7 @@ class OffsetFree:
     @property
     def why(self) -> str:
         """The violated conditions; empty if all hold."""
-        few = f"{self.n_d} disturbances for {self.n_y} outputs, but as many are needed"
+        few = f"{self.n_d} disturbances for {self.n_y} outputs: both numbers must be equal"
         parts = (self.why_undetectable, few * (self.n_d != self.n_y), self.why_unreachable)
         return "; ".join(part for part in parts if part)
 
@@ -79,7 +79,7 @@ class OffsetFree:
         if self.reachable:
             return ""
         ranks = f"(rank of the targets {self.target_rank}, needed {self.target_needed})"
-        why = remedy_for_unmoved(self.unmoved) or "Weigh other outputs in q_y"
+        why = remedy_for_unmoved(self.unmoved) or "Weight other outputs in q_y"
         return f"the inputs cannot hold the controlled outputs at arbitrary set-points {ranks}. {why}"
 
 

@@ -274,7 +274,8 @@ class SwitchingFilter:
     def _own(self, estimate: Estimate) -> SwitchingEstimate:
         if not isinstance(estimate, SwitchingEstimate) or len(estimate.z) != len(self.filters):
             raise InputError(
-                "SwitchingFilter: the estimate is of another filter. Begin with start() of this one. [HM-ESTIMATE-020]"
+                "SwitchingFilter: the estimate is of another filter. Begin with start() of this filter. "
+                "[HM-ESTIMATE-020]"
             )
         return estimate
 

@@ -6,7 +6,7 @@ standard deviation ``std`` that was found between recordings, and the time const
 covariance of ``theta`` cannot exceed ``std^2`` (a random walk's would grow without bound), the estimate stays where it
 is, and over a day it returns to the fitted value. A parameter stays within its bounds by a saturation of ``theta``.
 
-For everything behind the observer a tracked parameter is a measured disturbance: :func:`with_tracked` makes it one.
+For controller and monitor a tracked parameter is a measured disturbance: :func:`with_tracked` makes it one.
 
 Source: Simon, *Optimal State Estimation*, 2006, section 13.4; Ljung and Soderstrom, *Theory and Practice of Recursive
 Identification*, 1983, section 2.6, of prior information in tracking.
@@ -365,7 +365,8 @@ class TrackingFilter:
     def _own(self, estimate: Estimate) -> TrackedEstimate:
         if not isinstance(estimate, TrackedEstimate):
             raise InputError(
-                "TrackingFilter: the estimate is of another filter. Begin with start() of this one. [HM-ESTIMATE-027]"
+                "TrackingFilter: the estimate is of another filter. Begin with start() of this filter. "
+                "[HM-ESTIMATE-027]"
             )
         return estimate
 

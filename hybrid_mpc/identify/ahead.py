@@ -27,19 +27,19 @@ Array = NDArray[np.float64]
 STARTS = 4
 """Starts of predictions in a horizon."""
 BETTER = 0.97
-"""Ratio of errors from which on a further tracked parameter is worth its state."""
+"""Ratio of errors below which a further tracked parameter is used."""
 HARM = 1.02
 """Largest ratio of an output's error to that without tracking that counts as no harm."""
 WATCHED, RECORDINGS = 1500, 12
 """Periods of a recording, and recordings, evenly chosen, at most over which observers are compared."""
 UNLEARNED = 0.5
-"""Ratios above which load and parameter explain the same thing: of a parameter's standard deviation late in a recording
-to that at its start, and of the load with tracking to that without. In an example with a missing lag they are 0.87 and
-0.75, without it 0.2 and 0.3."""
+"""Ratios above which the recordings do not separate load and parameter: of a parameter's standard deviation late in a
+recording to that at its start, and of the load with tracking to that without. In an example with a missing lag they are
+0.87 and 0.75, without it 0.2 and 0.3."""
 LATE_ESTIMATES = 8
 """Estimates in the second half of a recording, over which loads and standard deviations are compared."""
 FAR = 1e6
-"""Largest error, over that of the untracked observer: what diverges counts as so much."""
+"""Limit of an error, over that of the untracked observer, also for diverging predictions."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Tracking:
     """The parameters to track, and what tracking changes in predictions of the recordings that chose them.
 
     Args:
-        tracked: The parameters; empty: none is worth it.
+        tracked: The parameters; empty if tracking does not improve predictions.
         ratio: Error of predictions over that without tracking, by output [-]. Default: 1 each.
         horizon: Length [s] of the predictions.
         tried: Mean ratio of errors by the tried parameters, ``"a, b"``.
@@ -181,9 +181,9 @@ def choose_tracked(
     candidates together, are tried, too. A parameter that the user declares as varying is always tracked. Parameters in
     the output equation are no candidates.
 
-    Two sets are needed, since either flatters. A prior that was fitted to the very recordings is closer to them than to
-    new ones, so tracking has less to gain. A prior that was fitted to fewer recordings is worse than the one that is
-    used, so tracking has more to gain.
+    Two sets are needed, since each alone is biased. A prior that was fitted to the very recordings is closer to them
+    than to new ones, so tracking has less to gain. A prior that was fitted to fewer recordings is worse than the one
+    that is used, so tracking has more to gain.
 
     Args:
         watched: Sets of evidence. Each has observers without tracking, each with the recordings that it is judged by.
@@ -218,7 +218,7 @@ def choose_tracked(
     def judged(chosen: Sequence[TrackedParameter], needed: float = math.inf) -> tuple[float, Array]:
         """Mean ratio of errors over recordings and outputs, and that of each output: the worst of the sets.
 
-        Sets behind one whose ratio is above ``needed`` are left out: they could not help.
+        Sets after one whose ratio exceeds ``needed`` are skipped, since the worst set decides.
         """
         outputs: list[Array] = []
         for one, floor, (_, starts) in zip(sets, floors, plain, strict=True):
@@ -278,8 +278,8 @@ def _unlearned(
     if not names or left < UNLEARNED:
         return ()
     return (
-        f"load and tracked parameters ({', '.join(names)}) explain the same thing: in the second half of a recording "
-        f"the parameters have {100 * late.max():.0f} % of their initial standard deviation, and the load is "
-        f"{100 * left:.0f} % of that without tracking. The prior may lack a term or a lag of an input: look at the "
-        "warnings of hybrid-mpc check --fit (docs/tracking.md) [HM-IDENTIFY-083]",
+        f"the recordings do not separate the load from the tracked parameters ({', '.join(names)}): in the second "
+        f"half of a recording the parameters have {100 * late.max():.0f} % of their initial standard deviation, and "
+        f"the load is {100 * left:.0f} % of that without tracking. The prior may lack a term, or the lag of an input: "
+        "read the warnings of hybrid-mpc check --fit (docs/tracking.md) [HM-IDENTIFY-083]",
     )

@@ -205,11 +205,11 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
     if not math.isfinite(figures[best].error):
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
     own = figures[best if chosen == prior else chosen]
-    bound = f"upper bound {own.upper:.2f}" if math.isfinite(own.upper) else "no upper bound: record more"
+    bound = f"upper bound {own.upper:.2f}" if math.isfinite(own.upper) else "no upper bound: too few data"
     whose = "its error" if own.share == 1 else f"with {own.share:g} of its correction, its error"
     error = f"{whose} on held-out data is {own.ratio:.2f} times the prior's ({bound}; {blocks})"
     if chosen == prior and own.upper < 1.0:
-        error += ", but over all of them together the prior's error is not larger"
+        error += ", but the prior's error over all these data together is not larger"
     if chosen == prior:
         return f"The fitted prior is recommended: {best} is not significantly better; {error}."
     return f"{chosen} is recommended: {error}."

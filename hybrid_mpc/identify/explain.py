@@ -79,12 +79,12 @@ GAIN = 0.7
 """Lower limit of a recording's ratio of errors in the upper bound. It makes the bound larger, and a single recording
 with a large reduction does not widen the interval."""
 POOR = 0.7
-"""Error [spreads] of a model that explains half of the outputs' variance. If the error with a term is larger, only a
+"""Relative error of a model that explains half of the outputs' variance. If the error with a term is larger, only a
 ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance. The same holds where all
 evidence is one recording: its blocks do not show what differs in the next."""
 DOUBT = 0.1
-"""Probability that the ratio lies beyond one end of its interval, for all fitted candidates of a step together. A term
-is added if the upper end is below 1."""
+"""Probability that the ratio exceeds one bound of its interval, for all fitted candidates of a step together. A term is
+added if the upper bound is below 1."""
 REACH = 3.0
 """Limit of an error of a free run, in spreads of the output, also for diverging runs."""
 FAR = 2.0
@@ -98,7 +98,7 @@ FEWEST, MANY = 3, 5
 """Minimum number of pieces of evidence for an interval; number of recordings from which on each recording is one
 piece."""
 GENERIC = ("product", "coupling")
-"""Laws that are no candidates where all evidence is one recording: they follow whatever differs within it."""
+"""Laws that are no candidates where all evidence is one recording: they adapt to any variation within the recording."""
 LEAST_T = 2.0
 """Minimum t-ratio: at least one weight of each new term must differ from zero by this many standard errors."""
 LEAST = 20
@@ -227,8 +227,8 @@ def _gathered(known: Sequence[Trajectory], prior: Prior, periods: int, warm: int
             count += blocks
         if count < FEWEST or groups < 2:
             raise InputError(
-                f"{len(present)} recording of {whole} samples is too little evidence for terms: record at least one "
-                f"more like it, or one of {2 * samples} samples and more [HM-IDENTIFY-011]"
+                f"{len(present)} recording of {whole} samples is too short to test terms. Add a similar recording, or "
+                f"record at least {2 * samples} samples [HM-IDENTIFY-011]"
             )
         text = f"{count} blocks of {text}"
     summary = Evidence(len(present), count, groups, periods * known[0].dt, f"{text} in {groups} groups")
@@ -371,7 +371,7 @@ class _Search:
     def slow_score(self, terms: Terms, theta: Array, ends: float) -> float:
         """Logarithm of the ratio of errors with a lag: derivatives at its nominal value do not predict its effect.
 
-        The better of a fit to the short windows, and a few iterations over the long ones: in short windows the first
+        The better of a fit to the short windows, and a few iterations over the long ones: in short windows the initial
         states explain a part of a lag.
         """
         start = self.start(terms, theta)
@@ -613,9 +613,9 @@ class _Explain:
             longest = samples // BLOCKS - 1
             if longest < min(LEAST, periods_of(length, dt, 2)):
                 raise InputError(
-                    f"one recording of {samples} samples is too little evidence for terms, which are evaluated on "
-                    f"{BLOCKS} parts of {LEAST} periods at least: record {BLOCKS * (LEAST + 1) - samples} samples "
-                    "more, or a second recording [HM-IDENTIFY-012]"
+                    f"one recording of {samples} samples is too short to test terms: {BLOCKS} parts of at least "
+                    f"{LEAST} periods are needed. Record {BLOCKS * (LEAST + 1) - samples} more samples, or a second "
+                    "recording [HM-IDENTIFY-012]"
                 )
         periods = min(periods_of(length, dt, 2), longest)
         self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
@@ -685,7 +685,7 @@ class _Explain:
     def _scored(self, number: int) -> tuple[_Ranked, _Ranked, list[Trial]]:
         """Single terms and pairs with the logarithm of their predicted ratio of errors, and failed candidates."""
         search, now = self.search, self.now
-        self.on_progress(0, len(self.pool), f"step {number}: {len(self.pool)} candidates are scored")
+        self.on_progress(0, len(self.pool), f"step {number}: scoring {len(self.pool)} candidates")
         plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if _vanishes(form)]
         some = [form for _, form in plain]
         promises = [
@@ -715,7 +715,7 @@ class _Explain:
                 scores.append((score, (form,)))
             lists[0] += [min(scores, key=lambda s: s[0])] if scores else []
             self.on_progress(
-                len(self.pool) - len(slow) + i, len(self.pool), f"step {number}: {one.name} is scored"
+                len(self.pool) - len(slow) + i, len(self.pool), f"step {number}: scoring {one.name}"
             )
         pairs: list[list[tuple[float, Terms]]] = [[], []]
         for by, ranked, found in zip(promises, among, pairs, strict=True):
@@ -729,15 +729,13 @@ class _Explain:
         search, now = self.search, self.now
         ends = search.error(now.terms, now.theta)
         for done, forms in enumerate(some):
-            self.on_progress(
-                done, len(some), f"{text}: {' and '.join(form.name for form in forms)} is fitted"
-            )
+            self.on_progress(done, len(some), f"{text}: fitting {' and '.join(form.name for form in forms)}")
             terms = (*now.terms, *forms)
             try:
                 own = search.begun(terms, now.theta)
                 left = math.sqrt(search.error(terms, own.theta) / ends)
                 if left > LOWERED:
-                    said = f"fitted to all data, the error with it is {left:.3f} times that without it"
+                    said = f"in a fit to all data, the error ratio with to without the term is {left:.3f}"
                     yield _Fitted(forms, None, own.theta, np.zeros(0), said, worse=True)
                     continue
                 indistinct = search.indistinct(terms, own, forms)
@@ -753,24 +751,24 @@ class _Explain:
         found = self.evidence.compared(squares, self.now.squares, candidates)
         reason = ""
         if not np.isfinite(squares).all():
-            return _Fitted(forms, None, theta, squares, "its free runs diverge")
+            return _Fitted(forms, None, theta, squares, "free runs with the term diverge")
         if found.ratio >= ADDED or squares.sum() >= self.now.squares.sum():
             less = "" if found.ratio >= ADDED else ", but the error over all samples is not smaller"
-            reason = f"the ratio to the model without it is {found.words}{less}"
+            reason = f"the error ratio with to without the term is {found.words}{less}"
         elif found.upper >= 1.0:
             more = self.evidence.needed(squares, self.now.squares, candidates)
-            reason = f"the ratio to the model without it is {found.words}: not significant"
+            reason = f"the error ratio with to without the term is {found.words}: not significant"
             if more:
-                reason += f"; record {more} more like these to show it"
+                reason += f"; {more} more such recordings would show the effect"
         elif self.evidence.summary.recordings == 1 and found.ratio > GAIN:
             reason = (
-                f"the ratio to the model without it is {found.words}, but with a single recording it must be below "
-                f"{GAIN:g}: record a second one"
+                f"the error ratio with to without the term is {found.words}, but must be below {GAIN:g} for a single "
+                "recording: add a second recording"
             )
         elif found.error > POOR and found.ratio > GAIN:
             reason = (
-                f"the ratio to the model without it is {found.words}: with an error of {found.error:.2f} spreads, a "
-                f"ratio above {GAIN:g} may be chance"
+                f"the error ratio with to without the term is {found.words}: with a relative error of "
+                f"{found.error:.2f}, a ratio above {GAIN:g} may be due to chance"
             )
         elif indistinct:
             reason = (
@@ -816,7 +814,7 @@ class _Explain:
         elif chosen is not None and one.held_out.ratio < WORTH:
             between = self.evidence.compared(one.squares, chosen.squares, 1)
             outcome = "alternative" if between.lower <= 1.0 else "worse"
-            reason = f"the ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
+            reason = f"the error ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
         elif one.held_out.ratio < 1.0:
             outcome = "unsure"
         return Trial(tuple(_found(form) for form in one.forms), outcome, one.held_out, reason)
@@ -921,7 +919,9 @@ def _reason(trials: Sequence[Trial], pieces: int) -> str:
     if not judged:
         return "no further candidate lowers the error in a Gauss-Newton step"
     best = min(judged, key=lambda trial: trial.held_out.ratio if trial.held_out else math.inf)
-    return f"{best.name}: {best.reason}" if best.reason else f"{best.name}: one of its terms is not needed"
+    return (
+        f"{best.name}: {best.reason}" if best.reason else f"{best.name}: one of the two terms is not needed"
+    )
 
 
 def _found(term: Term) -> FoundTerm:
@@ -954,7 +954,7 @@ def _check(prior: Prior, pool: Sequence[Candidate], own: Sequence[Term], points:
 
 
 def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> list[str]:
-    """Errors of a term that is declared a loss but supplies to a balance at some of the recordings' points."""
+    """Errors of a term that is declared a loss but adds to a balance at some points of the recordings."""
     given = tuple(v.T for v in points)
     values = {p.name: p.upper if math.isfinite(p.upper) else p.value or 1.0 for p in term.parameters}
     full = made({**prior.values, **values})
@@ -962,8 +962,8 @@ def _supplied(prior: Prior, made: type[Prior], term: Term, points: Points) -> li
         lost = after.loss(*given, full.p).full() - before.loss(*given, prior.p).full()
         if lost.min() < -1e-6 * max(np.abs(lost).max(), 1e-300):
             return [
-                f"term {term.name!r} is declared a loss, but supplies to the balance {before.name!r} at some of the "
-                "recordings' points; correct its sign, or leave loss=False. [HM-IDENTIFY-074]"
+                f"term {term.name!r} is declared a loss, but adds to the balance {before.name!r} at some points of the "
+                "recordings. Correct the sign of the term, or set loss=False. [HM-IDENTIFY-074]"
             ]
     return []
 

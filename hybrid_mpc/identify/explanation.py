@@ -58,9 +58,9 @@ class HeldOutError:
     Args:
         error: Error with the change [-].
         ratio: Error with the change over the error without it [-]: geometric mean over the pieces of evidence.
-        lower: Lower end of the ratio's interval [-]. The probability of a ratio below it is 10 %, divided by the number
-            of candidates that were fitted in the step.
-        upper: Upper end of the ratio's interval [-], likewise; infinite with too few pieces of evidence.
+        lower: Lower bound of the ratio's interval [-]. The probability of a ratio below it is 10 %, divided by the
+            number of candidates that were fitted in the step.
+        upper: Upper bound of the ratio's interval [-], likewise; infinite with too few pieces of evidence.
         harm: Probability that the change increases the expected error by more than 5 %, times the number of candidates
             that were fitted in the step, at most 1.
     """
@@ -77,11 +77,11 @@ class HeldOutError:
 
         Example:
             >>> HeldOutError(0.1, 0.954, 0.8, 1.13, 0.2).words, HeldOutError(0.1, 0.954, 0.0, float("inf"), 1.0).words
-            ('0.95 (0.80 to 1.13)', '0.95 (no upper end)')
+            ('0.95 (0.80 to 1.13)', '0.95 (no upper bound)')
         """
         if self.lower > 0.0:
             return f"{self.ratio:.2f} ({self.lower:.2f} to {self.upper:.2f})"
-        end = f"upper end {self.upper:.2f}" if self.upper < 1e6 else "no upper end"
+        end = f"upper bound {self.upper:.2f}" if self.upper < 1e6 else "no upper bound"
         return f"{self.ratio:.2f} ({end})"
 
 
@@ -116,8 +116,8 @@ class Trial:
     Args:
         terms: The candidate's terms: one, or a pair.
         outcome: ``"added"``; ``"alternative"``: not significantly different from the added terms; ``"unsure"``: the
-            error is smaller, but not significantly; ``"worse"``: the error is not smaller, or surely larger than with
-            the added terms; ``"diverged"``: the fit failed.
+            error is smaller, but not significantly; ``"worse"``: the error is not smaller, or significantly larger than
+            with the added terms; ``"diverged"``: the fit failed.
         held_out: Error over held-out data; None if the fit failed or did not reduce the error over all data.
         reason: Why the candidate was not added; empty if it was.
     """
@@ -138,7 +138,7 @@ class Trial:
         smaller = self.held_out is not None and self.held_out.ratio < 1.0
         if self.outcome == "worse" and (smaller or self.held_out is None):
             return "worse than the added term" if smaller else "no gain"
-        return "not surely better" if self.outcome == "unsure" else self.outcome
+        return "not significantly better" if self.outcome == "unsure" else self.outcome
 
 
 @dataclass(frozen=True)

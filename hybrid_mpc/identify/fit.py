@@ -141,7 +141,7 @@ def fit_prior(
     noise = np.array(smoother.sizes.noise)
     every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
     fit.points = visited(every)
-    if fit.substeps(fit.nominal) > smoother.substeps:  # stiff where the recordings go
+    if fit.substeps(fit.nominal) > smoother.substeps:  # stiff in the region of the recordings
         smoother = replace(smoother, substeps=fit.substeps(fit.nominal))
         every = with_states([*train, *valid], smoother, fit.delay(fit.nominal))
         fit.points = visited(every)
@@ -196,7 +196,7 @@ def fit_prior(
                 every = with_states([*train, *valid], again, fit.delay(followed[0]))
                 guesses = every[: len(train)], every[len(train) :]
         whole = most_samples(guesses[0]) - fit.lead - 1
-        # whole recordings pay from 1.2 times the windows before on
+        # whole recordings are used from 1.2 times the previous length on
         more = whole > 1.2 * periods and 0.8 * min(whole, LONGEST) * dt < fit.reach(followed[0])
         if more and _quiet(problem, followed[0], noise):  # fewer windows have fewer unknown initial states
             on_progress(total - 1, total, "whole recordings")
@@ -314,8 +314,8 @@ def beyond_ranges(prior: Prior, smoothed: Sequence[Trajectory]) -> tuple[str, ..
     x = np.concatenate([t.x for t in smoothed])
     # 5 % of its own span: a smoother overshoots
     return tuple(
-        f"{s.label} goes from {low:.4g} to {high:.4g} with the fitted values, beyond its range [{s.lower:g}, "
-        f"{s.upper:g}]: the range is wrong, or the prior lacks what keeps it within"
+        f"with the fitted values, {s.label} reaches {low:.4g} to {high:.4g}, outside its range [{s.lower:g}, "
+        f"{s.upper:g}]: the range is wrong, or the prior lacks an effect that limits {s.name}"
         for s, low, high in zip(prior.states, x.min(0), x.max(0), strict=True)
         if low < s.lower - 0.05 * (high - low) or high > s.upper + 0.05 * (high - low)
     )
@@ -393,7 +393,7 @@ def _lengths(
         wanted.append(wanted[-1] * APART)
     wanted.append(length)
     grown = [reach * math.log(own) / math.log(GROWN[-1]) for own in GROWN]
-    # beyond three times that growth, first states are lost in rounding
+    # beyond three times that growth, rounding errors hide the initial states
     slow = sorted({min(own, 3.0 * grown[-1]) for own in wanted if own > 1.5 * grown[-1]})
     if slow:
         wanted = [*grown, *slow]

@@ -40,16 +40,16 @@ def warnings_of(
     warnings = []
     if answered > 1.0:
         warnings.append(
-            "inputs respond to the outputs, as in a closed loop: disturbances may bias the parameters; prediction "
-            "errors were fitted, too, and the validation chose"
+            "inputs respond to the outputs, as in a closed loop: disturbances may bias the parameters, so prediction "
+            "errors were fitted, too; validation data selected the fit"
         )
     if not len(chosen.covariance):
         return (*warnings, "no fit improved on the nominal parameters") if fit.free else ()
     # error of a fit over that of the nominal values above which the fit is no improvement
     if gained > 0.98 and not _confirmed(fit, chosen):
         warnings.append(
-            f"the fit hardly improves on the nominal parameters (its error is {gained:.3f} of theirs): either they are "
-            "right, or the prior lacks an effect that no parameter describes"
+            f"the fit hardly improves on the nominal parameters (error ratio {gained:.3f}): either the nominal "
+            "parameters are right, or the prior lacks an effect that no parameter describes"
         )
     warnings += [str(one) for one in chosen.unidentified]
     for p, value, low, high in zip(fit.free, chosen.theta, fit.lower, fit.upper, strict=False):
@@ -59,7 +59,7 @@ def warnings_of(
 
 
 def _confirmed(fit: OutputFit, chosen: Fitted) -> bool:
-    """Whether the fit surely finds the nominal values again, as after they were taken from an earlier fit."""
+    """Whether the fit confirms the nominal values, as after they were taken from an earlier fit."""
     count = len(fit.free)
     nominal, sizes = fit.nominal[:count], np.abs(fit.nominal[:count])
     near = np.abs(chosen.theta[:count] - nominal) <= NEARLY * sizes
@@ -93,7 +93,7 @@ def late_inputs(
         ()
         if found is None or not found.surely
         else (
-            f"{found}: such a delay would reduce the errors over training and validation recordings to "
+            f"{found}: such a delay would reduce the errors over training and validation recordings by the factors "
             f"{' and '.join(f'{ratio:.2f}' for ratio in found.ratios)}. {ADD_DELAY} [HM-IDENTIFY-080]",
         )
     )

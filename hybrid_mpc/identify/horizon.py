@@ -45,7 +45,7 @@ branch to another if a sensor is ambiguous (``|v|``, ``l sin q``)."""
 
 @dataclass(frozen=True)
 class Stretches:
-    """Samples of ``b`` trajectories, one behind the other.
+    """Samples of ``b`` trajectories, one after the other.
 
     Args:
         y: Measured outputs ``(n, n_y)``; NaN for a missing sample.

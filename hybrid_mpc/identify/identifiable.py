@@ -12,7 +12,7 @@ from hybrid_mpc.identify.output_fit import LOOSE, OutputFit
 from hybrid_mpc.identify.prior_result import Combination
 
 Array = NDArray[np.float64]
-UNTOLD = 1.0
+UNIDENTIFIED = 1.0
 """Standard error, in half ranges, above which a combination of parameters counts as not identifiable."""
 CLUSTERS = 48
 """Minimum number of parts of the windows whose scatter gives the standard errors."""
@@ -66,27 +66,27 @@ def covariance(
     half = fit.half
     rows = (slopes * np.sqrt(falling)[..., None]).reshape(-1, k) * half
     _, values, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
-    told = np.zeros(k)
-    told[: len(values)] = np.where(values > ROUNDED * values[0], values, 0.0)
-    # theta = back @ c, with coordinates c whose information is diag(told^2)
+    known = np.zeros(k)
+    known[: len(values)] = np.where(values > ROUNDED * values[0], values, 0.0)
+    # theta = back @ c, with coordinates c whose information is diag(known^2)
     back = directions.T * half[:, None]
     scores = (slopes * error[..., None]).reshape(n, -1, outputs, k).sum(axis=2)
     parts = min(math.ceil(CLUSTERS / n), scores.shape[1])
     begins = np.arange(parts) * scores.shape[1] // parts
     scores = np.add.reduceat(scores, begins, axis=1).reshape(-1, k)
     left = max(counted - k - taken, 0.5 * counted)  # degrees of freedom
-    scores = scores @ back * (told > 0)
+    scores = scores @ back * (known > 0)
     middle = scores.T @ scores * (counted / max(left, 1.0)) * len(scores) / max(len(scores) - 1, 1)
-    inverse = 1.0 / (np.square(told) + LOOSE**-2)
+    inverse = 1.0 / (np.square(known) + LOOSE**-2)
     found = back @ ((middle + LOOSE**-2 * np.eye(k)) * np.outer(inverse, inverse)) @ back.T
     found = 0.5 * (found + found.T)
     white = float(np.square(error).sum()) / max(left, 1.0)  # variance of weighted errors if they were white
-    least = np.square(back) @ (inverse * inverse * (white * np.square(told) + LOOSE**-2))
+    least = np.square(back) @ (inverse * inverse * (white * np.square(known) + LOOSE**-2))
     short = np.sqrt(np.maximum(least / np.maximum(np.diag(found), 1e-300), 1.0))
     found = found * np.outer(short, short)
     values, directions = np.linalg.eigh(found / np.outer(half, half))
-    untold = directions[:, values >= UNTOLD**2].T
-    unknown = tuple(_combination(fit, theta, found, one) for one in untold)
+    unidentified = directions[:, values >= UNIDENTIFIED**2].T
+    unknown = tuple(_combination(fit, theta, found, one) for one in unidentified)
     bounded = directions * np.minimum(values, 1.0) @ directions.T * np.outer(half, half)
     return bounded, tuple({one.parameters: one for one in unknown}.values())
 
@@ -134,9 +134,9 @@ def correlations(fit: OutputFit, chosen: Fitted) -> dict[str, float]:
     """Correlation of the errors of every two fitted parameters, by ``"a, b"``."""
     c = chosen.covariance
     sigma = np.sqrt(np.maximum(np.diag(c), 1e-300)) if len(c) else np.zeros(0)
-    told = [i for i in range(min(len(c), len(fit.free))) if math.isfinite(sigma[i])]
+    finite = [i for i in range(min(len(c), len(fit.free))) if math.isfinite(sigma[i])]
     return {
         f"{fit.names[i]}, {fit.names[j]}": float(c[i, j] / (sigma[i] * sigma[j]))
-        for k, i in enumerate(told)
-        for j in told[k + 1 :]
+        for k, i in enumerate(finite)
+        for j in finite[k + 1 :]
     }

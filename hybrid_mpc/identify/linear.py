@@ -483,11 +483,11 @@ def _checked(train: Sequence[Measured], valid: Sequence[Measured], dt: float, wa
         seen = y[np.isfinite(y[:, j]), j]
         if not len(seen) or is_constant(seen):
             problems.append(
-                f"output {j + 1}: constant in the training recordings. Leave it out, or record it in motion"
-                " [HM-IDENTIFY-035]"
+                f"output {j + 1}: constant in the training recordings. Remove this output, or record it in motion "
+                "[HM-IDENTIFY-035]"
             )
     problems += [
-        f"input {j + 1}: constant in the training recordings, so its effect is unknown. Leave it out, or give "
+        f"input {j + 1}: constant in the training recordings, so its effect is unknown. Remove this input, or give "
         "recordings in which it changes [HM-IDENTIFY-036]"
         for j in still if j < n_commanded
     ]  # fmt: skip
@@ -525,9 +525,9 @@ def _long_enough(enough: Sequence[int], short: Sequence[str], default: bool, dat
     if enough and (default or not short):
         return
     lengths = ", ".join(str(len(y)) for y, _ in data.runs[:5]) + (", ..." if len(data.runs) > 5 else "")
-    told = short[:1] if default else short
+    named = short[:1] if default else short
     raise InputError(
-        f"recordings too short: {'; '.join(told)} without a missing sample in the training recordings "
+        f"recordings too short: {'; '.join(named)} without a missing sample in the training recordings "
         f"(samples: {lengths}). Record longer ones, or use smaller orders [HM-IDENTIFY-038]"
     )
 
@@ -739,15 +739,15 @@ def _root(covariance: Array) -> Array:
 def _doubts(data: _Data, inputs: Array, what: str) -> tuple[str, ...]:
     """Warnings about insufficient excitation, from the R factor of the lagged inputs."""
     doubts = [
-        f"measured disturbance (input {j + 1}) never changes in the training recordings: the model does not know it"
+        f"measured disturbance (input {j + 1}) never changes in the training recordings, so the model lacks its effect"
         for j in data.still
     ]
     size = np.linalg.svd(inputs[:, np.abs(inputs).max(axis=0) > 0], compute_uv=False)
     rank = int(np.sum(size > RANK * size[0]))
     if rank < len(size):
         doubts.append(
-            f"the inputs excite {rank} of the {len(size)} directions of {what}: another model explains the recordings "
-            "as well; excite more frequencies, each input on its own"
+            f"the inputs excite {rank} of the {len(size)} directions of {what}: other models explain the recordings "
+            "equally well. Excite more frequencies, each input independently"
         )
     return tuple(doubts)
 
@@ -792,7 +792,9 @@ def _best(tried: Iterable[LinearModel | Candidate], valid: Sequence[Measured], w
     doubts = (
         ()
         if stable
-        else (f"no candidate is stable: this one has an eigenvalue of size {best.chosen.radius:.6g}",)
+        else (
+            f"no candidate is stable: the selected one has an eigenvalue of magnitude {best.chosen.radius:.6g}",
+        )
     )
     return replace(best, candidates=tuple(candidates), warnings=best.warnings + doubts)
 

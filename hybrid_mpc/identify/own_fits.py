@@ -25,12 +25,13 @@ from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 COMPARED = WINDOWS // WINDOWS_OF_EACH
-"""Largest number of recordings that are fitted alone, evenly chosen: so all of them have as many windows as the fit."""
+"""Largest number of recordings that are fitted alone, evenly chosen: so that their windows are as many as those of the
+fit."""
 DIFFERENT = 0.8
-"""Error with own values over that with common ones below which a difference is reported: what the prior lacks moves a
-parameter from recording to recording, too, and then to 0.86 and above in examples."""
+"""Error with own values over that with common ones below which a difference is reported: effects that the prior lacks
+also change a parameter between recordings; the ratio is then 0.86 and above in examples."""
 LISTED = 6
-"""Largest number of recordings whose values are listed; of more the smallest and the largest value."""
+"""Largest number of recordings whose values are listed; beyond this number the smallest and the largest value."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +54,15 @@ class OwnFits:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the recordings show one by one that the common fit hides."""
+        """Effects that separate fits show and the common fit hides."""
         each = "block of the recording" if self.varying.blocks else "recording"
         found = []
         if self.late:
             delays, ratios = [one.delay for one in self.late], [max(one.ratios) for one in self.late]
             found.append(
-                f"in each {each} alone, inputs seem to act {_span(delays)} s later than recorded: such a delay would "
-                f"reduce the error of each fit to {_span(ratios)}. In the common fit, differences between recordings "
-                f"hide the delay. {ADD_DELAY} [HM-IDENTIFY-081]"
+                f"in separate fits to each {each}, inputs seem to act {_span(delays)} s later than recorded: such a "
+                f"delay would reduce the error of each fit by a factor of {_span(ratios)}. In the common fit, "
+                f"differences between recordings hide the delay. {ADD_DELAY} [HM-IDENTIFY-081]"
             )
         if self.values and self.ratio < DIFFERENT:
             units = {p.name: p.unit for p in self.varying.parameters}
@@ -70,9 +71,9 @@ class OwnFits:
                 for name, values in self.values.items()
             )
             found.append(
-                f"parameters differ from {each} to {each}: {listed}. With own values for each {each}, the error of "
-                f"free runs falls to {100 * self.ratio:.0f} %. Add missing terms first; then track what still differs "
-                "(hybrid-mpc run --track, docs/tracking.md) [HM-IDENTIFY-082]"
+                f"parameters differ from {each} to {each}: {listed}. With separate values for each {each}, the error "
+                f"of free runs falls to {100 * self.ratio:.0f} %. Add missing terms first; then track the parameters "
+                "that still differ (hybrid-mpc run --track, docs/tracking.md) [HM-IDENTIFY-082]"
             )
         return tuple(found)
 
@@ -88,8 +89,8 @@ def fit_each(
 ) -> OwnFits | None:
     """Fit the varying parameters to each recording alone, and look for a late input in each.
 
-    Evidence decides which parameters vary (:func:`~hybrid_mpc.identify.varying.find_varying`). Of a recording that is
-    too short, and of more than ``COMPARED`` recordings, some are left out.
+    Evidence decides which parameters vary (:func:`~hybrid_mpc.identify.varying.find_varying`). Recordings that are too
+    short are left out; of more than ``COMPARED`` recordings, evenly chosen ones are used.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.

@@ -64,7 +64,7 @@ class Prediction:
         free_run: Free runs with the measured inputs; each starts from the state after a warm-up.
         one_step: One-step predictions of the loops' observer; None if the artifact has no observer.
         reason: Why there are no one-step predictions. Default: there are one-step predictions.
-        run_length: Length [s] of the free runs, one behind the other. Default: one run over the recording.
+        run_length: Length [s] of the free runs, one after the other. Default: one run over the recording.
     """
 
     name: str

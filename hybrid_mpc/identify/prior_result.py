@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 CORRELATED = 0.99
 """Correlation of the errors of two parameters above which the two are reported."""
 ENOUGH = 1.01
-"""Ratio to the least error up to which the longest windows win: long windows identify the parameters best."""
+"""Ratio to the least error up to which the longest windows are used: long windows identify the parameters best."""
 PREDICTIONS = "predictions"
 """Name of the stage that is fitted by predictions one period ahead instead of free runs."""
 LEAST_T = 2.0
@@ -55,7 +55,7 @@ class Combination:
 
     Example:
         >>> print(Combination(("k", "m"), (1.0, -1.0), True, 0.01))
-        only a combination of k, m is identifiable: k * m^-1, to 1 %
+        only a combination of k, m is identifiable: k * m^-1, standard error 1 %
     """
 
     parameters: tuple[str, ...]
@@ -69,10 +69,10 @@ class Combination:
         of = [(name, w) for name, w in zip(self.parameters, self.weights, strict=True) if abs(w) >= 0.005]
         if self.product:
             text = " * ".join(name if abs(w - 1.0) < 0.005 else f"{name}^{w:.2g}" for name, w in of)
-            text += f", to {100 * self.error:.2g} %"
+            text += f", standard error {100 * self.error:.2g} %"
         else:
             text = " + ".join(name if abs(w - 1.0) < 0.005 else f"{w:.3g} {name}" for name, w in of)
-            text = text.replace("+ -", "- ") + f", to {self.error:.2g}"
+            text = text.replace("+ -", "- ") + f", standard error {self.error:.2g}"
         return f"only a combination of {', '.join(self.parameters)} is identifiable: {text}"
 
 
@@ -134,12 +134,13 @@ class PriorFit:
     def identifiability(self) -> tuple[str, ...]:
         """Texts about poorly identifiable parameters: :attr:`warnings`, correlations above 0.99, t-ratios below 2."""
         close = [
-            f"{names.replace(', ', ' and ')} can hardly be told apart: their errors are correlated by {value:.3f}"
+            f"{names.replace(', ', ' and ')} are hardly identifiable separately: the correlation of their errors is "
+            f"{value:.3f}"
             for names, value in self.correlations.items()
             if abs(value) > CORRELATED
         ]
         small = [
-            f"{name} may be zero: {abs(ratio):.1f} standard errors"
+            f"{name} may be zero: its value is {abs(ratio):.1f} standard errors"
             for name, ratio in self.t_ratios.items()
             if abs(ratio) < LEAST_T
         ]

@@ -14,7 +14,7 @@ from hybrid_mpc.rules import Name, NotNegative, Positive
 Kind = Literal["rnn", "pgrnn", "mopgrnn"]
 PriorParameters = Literal["fixed", "trained"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-NO_BALANCE = "the prior has no balance, so a MOPGRNN would be the PGRNN once more"
+NO_BALANCE = "the prior has no balance, so a MOPGRNN would equal the PGRNN"
 """Why there is no MOPGRNN of a prior without balances."""
 
 

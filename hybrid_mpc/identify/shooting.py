@@ -211,7 +211,7 @@ class Shooting:
         """Short fits from several ``thetas`` ``(m, k)`` in one batch of free runs.
 
         Args:
-            fit: The fit of several ``thetas``, whose windows lie one behind the other.
+            fit: The fit of several ``thetas``, whose windows lie one after the other.
             thetas: Starts.
             steps: Pairs of Gauss-Newton steps; 0: only initial states are fitted.
             free: Number of fitted parameters, from the first one on. Default: all.
@@ -309,9 +309,8 @@ class Shooting:
         return self._eliminated(self._rescaled(self.start(theta, x, "all")))[:2]
 
     def scaled_slopes(self, theta: Array) -> tuple[Array, Array, Array]:
-        """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` from the best first states, these
-        eliminated, by the root of their robust weights [output units]; and the scale of each output's errors
-        ``(n_y,)``.
+        """Slopes ``(n, m, k)`` by ``theta`` and errors ``(n, m)`` at ``theta`` with the best initial states eliminated,
+        by the root of their robust weights [output units]; and the scale of each output's errors ``(n_y,)``.
         """
         point = self._rescaled(self.start(theta, self.first_states(theta), "all"))
         slopes, error, *_ = self._eliminated(point)
@@ -486,7 +485,7 @@ class Shooting:
         return left[..., :-1], left[..., -1], np.asarray(follow, dtype=np.float64), taken
 
     def _behind(self, point: _Point) -> tuple[Array, ...]:
-        """As :meth:`_normal`, for the samples after the warm-up; the warm-up alone determines the first states."""
+        """As :meth:`_normal`, for the samples after the warm-up; the warm-up alone determines the initial states."""
         b, error, follow, _ = self._eliminated(point)
         n_x = point.x.shape[1]
         pull, from_nominal = self._pull(point, b.shape[-1])

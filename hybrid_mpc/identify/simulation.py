@@ -259,7 +259,7 @@ def required_substeps(prior: Prior, dt: float, points: Points | None = None) -> 
     fastest = np.where(modes.real <= 0, np.abs(modes), 0.0).max(axis=1, initial=0.0)
     if not len(fastest):
         return substeps
-    usual = _substeps(float(np.quantile(fastest, USUALLY)), dt, name, "where the recordings go")
+    usual = _substeps(float(np.quantile(fastest, USUALLY)), dt, name, "in the region of the recordings")
     return max(substeps, usual, min(MAX_SUBSTEPS, math.ceil(float(fastest.max()) * dt)))
 
 

@@ -297,7 +297,7 @@ class _Runs:
         return np.asarray(np.arange(self.y.shape[1]) < np.array(self.lengths)[:, None])
 
     def times(self, m: int) -> _Runs:
-        """Repeat the runs ``m`` times, one behind the other."""
+        """Repeat the runs ``m`` times, one after the other."""
         own = (
             np.concatenate([v] * m) for v in (self.y, self.seen, self.censored, self.u, self.w, self.first)
         )
@@ -345,8 +345,8 @@ def _innovations(
 ) -> list[tuple[float, float, int]]:
     """Sums of squared innovations over their variances and of log determinants, and number of innovations.
 
-    Of each of several smoothers that differ only in noise and walk. The filter starts with a large covariance; the
-    first samples, which reduce it, are not counted.
+    One value for each of several smoothers that differ only in noise and walk. The filter starts with a large
+    covariance; the first samples, which reduce it, are not counted.
     """
     one, m = smoothers[0], len(smoothers)
     squares, logs, count = np.zeros(m), np.zeros(m), np.zeros(m)

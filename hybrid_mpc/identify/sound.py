@@ -53,7 +53,7 @@ class BoundCost:
 
     Example:
         >>> print(BoundCost("k", 2.0, 2.6, 0.8))
-        k ends at its bound 2; with a wider one it is 2.6, and the error falls to 80 %
+        k ends at its bound 2; with a wider bound the fit gives 2.6, and the error falls to 80 %
     """
 
     parameter: str
@@ -69,9 +69,10 @@ class BoundCost:
     def __str__(self) -> str:
         ends = f"{self.parameter} ends at its bound {self.value:.4g}"
         if not self.costs:
-            return f"{ends}: the error without it is the same to {100 * (1 - COSTLY):.0f} %"
+            return f"{ends}; without the bound, the error changes by less than {100 * (1 - COSTLY):.0f} %"
         return (
-            f"{ends}; with a wider one it is {self.free:.4g}, and the error falls to {100 * self.ratio:.0f} %"
+            f"{ends}; with a wider bound the fit gives {self.free:.4g}, and the error falls to "
+            f"{100 * self.ratio:.0f} %"
         )
 
 
@@ -108,9 +109,9 @@ def problems(smoother: Smoother, fit: PriorFit, smoothed: Sequence[Trajectory]) 
         # largest share of samples at the bounds of the smoothed states that can be outliers
         if away > 0.05:
             found.append(
-                f"{state.label}: at or beyond three times its range [{state.lower:g}, {state.upper:g}] in {away:.0%} "
-                f"of the smoothed samples ({x.min():.4g} to {x.max():.4g}). Either no sensor determines it, or its "
-                "range or an equation with it is wrong [HM-IDENTIFY-077]"
+                f"{state.label}: three times its range [{state.lower:g}, {state.upper:g}] or more in {away:.0%} of the "
+                f"smoothed samples ({x.min():.4g} to {x.max():.4g}). Either the state is not observable, or its range "
+                "or an equation is wrong [HM-IDENTIFY-077]"
             )
     return tuple(found)
 
@@ -165,10 +166,10 @@ def warn_of_stability(
         return ()
     which, other = ("nominal", "fitted") if nominal < fitted else ("fitted", "nominal")
     return (
-        f"with {which} parameters the prior is unstable (small errors grow tenfold in {min(nominal, fitted):.2g} s), "
-        f"with {other} ones they hardly grow. Recordings in closed loop do not tell which is right, and a controller "
-        "for the wrong one may fail: compare with what the machine does without control, and narrow the bounds of the "
-        "parameters that decide it (docs/unstable.md) [HM-IDENTIFY-085]",
+        f"the prior is unstable with {which} parameters (small errors grow tenfold in {min(nominal, fitted):.2g} s), "
+        f"but hardly or not with {other} parameters. Recordings in closed loop do not show which is right, and a "
+        "controller for the wrong parameters may fail. Compare with the machine without control, and narrow the "
+        "bounds of the parameters that decide stability (docs/unstable.md) [HM-IDENTIFY-085]",
     )
 
 
@@ -256,7 +257,7 @@ def structure_doubt(error: float, baselines: Mapping[str, float]) -> str:
 
     Example:
         >>> structure_doubt(0.35, {"constant": 1.1, "ARX": 0.3, "N4SID": 0.22})
-        'the linear model N4SID has an error of 0.22 on unseen recordings, the fitted prior 0.35'
+        'the linear model N4SID has an error of 0.22 on test recordings, the fitted prior 0.35'
         >>> structure_doubt(0.35, {"constant": 1.1, "ARX": 0.3})
         ''
     """
@@ -268,7 +269,7 @@ def structure_doubt(error: float, baselines: Mapping[str, float]) -> str:
         return ""
     if name != "constant" and baselines[name] >= CLEARLY * error:
         return ""
-    return f"{model} has an error of {baselines[name]:.3g} on unseen recordings, the fitted prior {error:.3g}"
+    return f"{model} has an error of {baselines[name]:.3g} on test recordings, the fitted prior {error:.3g}"
 
 
 def bounds_doubt(bounds: Sequence[BoundCost], fitted: int) -> str:
@@ -285,7 +286,7 @@ def bounds_doubt(bounds: Sequence[BoundCost], fitted: int) -> str:
         >>> bounds_doubt(own, 6)
         ''
         >>> bounds_doubt([BoundCost("k", 2.0, 2.6, 0.5)], 6)
-        'k ends at its bound 2; with a wider one it is 2.6, and the error falls to 50 %'
+        'k ends at its bound 2; with a wider bound the fit gives 2.6, and the error falls to 50 %'
     """
     # share of the fitted parameters at bounds from which on they compensate a missing effect
     if len(bounds) > 1 and len(bounds) >= 0.5 * fitted:
@@ -343,10 +344,10 @@ def warn_of_worse_fit(
         return ()
     return (
         f"on the test recordings the error with nominal parameters is {own.ratio:.2f} times that with fitted ones "
-        f"(upper bound {own.upper:.2f}; {found.blocks} {'recordings' if len(set(recordings)) > 1 else 'blocks'}). The "
-        "training recordings lack the motion of the test recordings, or an effect that the prior lacks biases the fit. "
-        "Record more like the test recordings, search the effect with 'hybrid-mpc explain', or keep known values: "
-        "Parameter(..., fixed=True), or narrower bounds [HM-IDENTIFY-084]",
+        f"(upper bound {own.upper:.2f}; {found.blocks} {'recordings' if len(set(recordings)) > 1 else 'blocks'}). "
+        "Either the training recordings do not cover the conditions of the test recordings, or the prior lacks an "
+        "effect. Add training recordings of these conditions, search the effect with 'hybrid-mpc explain', or keep "
+        "known values: Parameter(..., fixed=True), or narrower bounds [HM-IDENTIFY-084]",
     )
 
 
@@ -360,12 +361,12 @@ def fit_doubt(fit_percent: Mapping[str, float], share: Mapping[str, float]) -> s
 
     Example:
         >>> fit_doubt({"phi [rad]": -60.0, "level [m]": -40.0}, {"phi [rad]": 1.4, "level [m]": 0.1})
-        'free runs of phi have a FIT of -60 % on unseen recordings: its mean has less error'
+        'free runs of phi have a FIT of -60 % on test recordings: the mean of the output has a smaller error'
     """
     poor = [name for name, fit in fit_percent.items() if fit < NEGATIVE and share[name] > POOR]
     return "; ".join(
-        f"free runs of {name.partition(' [')[0]} have a FIT of {fit_percent[name]:.0f} % on unseen recordings: its "
-        "mean has less error"
+        f"free runs of {name.partition(' [')[0]} have a FIT of {fit_percent[name]:.0f} % on test recordings: the mean "
+        "of the output has a smaller error"
         for name in poor
     )
 
@@ -382,21 +383,18 @@ def no_gain(unseen: Mapping[str, float], training: Mapping[str, float]) -> str:
 
     Example:
         >>> no_gain({"phy": 1.2, "phy_nominal": 2.0, "constant": 0.8}, {"phy": 1.1, "constant": 1.0})
-        'on unseen recordings a constant has an error of 0.8, the fitted prior 1.2; on the training ones 1 and 1.1'
+        'on test recordings a constant has an error of 0.8, the fitted prior 1.2; on training recordings 1 and 1.1'
         >>> no_gain({"phy": 0.5, "phy_nominal": 0.3, "constant": 1.0}, {})
-        'on unseen recordings the nominal parameters have an error of 0.3, the fitted ones 0.5'
+        'on test recordings the nominal parameters have an error of 0.3, the fitted ones 0.5'
         >>> no_gain({"phy": 0.05, "phy_nominal": 0.03, "constant": 1.0}, {})
         ''
     """
     error, nominal, constant = (unseen[name] for name in ("phy", "phy_nominal", "constant"))
     if error >= constant and training["phy"] >= training["constant"]:
         return (
-            f"on unseen recordings a constant has an error of {constant:.3g}, the fitted prior {error:.3g}; on the "
-            f"training ones {training['constant']:.3g} and {training['phy']:.3g}"
+            f"on test recordings a constant has an error of {constant:.3g}, the fitted prior {error:.3g}; on training "
+            f"recordings {training['constant']:.3g} and {training['phy']:.3g}"
         )
     if error > POOR and nominal < CLEARLY * error:
-        return (
-            f"on unseen recordings the nominal parameters have an error of {nominal:.3g}, the fitted ones "
-            f"{error:.3g}"
-        )
+        return f"on test recordings the nominal parameters have an error of {nominal:.3g}, the fitted ones {error:.3g}"
     return ""

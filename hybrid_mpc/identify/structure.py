@@ -35,18 +35,18 @@ LARGEST = 1e7
 """Largest factor, above the largest unit error of 1e6."""
 READINGS = (
     (-1.0, "its sign seems wrong"),
-    (180 / math.pi, "radians seem to stand for degrees"),
-    (math.pi / 180, "degrees seem to stand for radians"),
+    (180 / math.pi, "the unit seems to be rad instead of deg"),
+    (math.pi / 180, "the unit seems to be deg instead of rad"),
     (60.0, "a factor of 60 is missing, as between minutes and seconds"),
-    (1 / 60, "it is 60 times too large, as between minutes and seconds"),
+    (1 / 60, "the value is 60 times too large, as between minutes and seconds"),
     (3600.0, "a factor of 3600 is missing, as between hours and seconds"),
-    (1 / 3600, "it is 3600 times too large, as between hours and seconds"),
+    (1 / 3600, "the value is 3600 times too large, as between hours and seconds"),
     (2 * math.pi, "a factor of 2 pi is missing, as between turns and radians"),
-    (0.5 / math.pi, "it is 2 pi times too large, as between turns and radians"),
+    (0.5 / math.pi, "the value is 2 pi times too large, as between turns and radians"),
     (2.0, "a factor of 2 is missing"),
-    (0.5, "it seems to be counted twice"),
+    (0.5, "the term seems to be included twice"),
     *((10.0**k, f"a factor of 1e{k} is missing, as between units") for k in (1, 2, 3, 5, 6)),
-    *((10.0**-k, f"it is 1e{k} times too large, as between units") for k in (1, 2, 3, 5, 6)),
+    *((10.0**-k, f"the value is 1e{k} times too large, as between units") for k in (1, 2, 3, 5, 6)),
 )
 """Factors that identify the mistake, and their texts."""
 UNITS = tuple(v for one in (10.0, 60.0, 1e3, 1e5) for v in (one, 1 / one))
@@ -84,7 +84,7 @@ MOST = 3
 """Maximum number of equal explanations that are reported."""
 
 
-VAGUE = ("its sign seems wrong, and its size too", "a factor or a unit seems to be wrong")
+VAGUE = ("its sign and its size seem wrong", "a factor or a unit seems to be wrong")
 """Texts for other factors: negative, and positive."""
 COMMON = 0.05, 15.0
 """Range of positive factors that missing physics can also cause, so they do not identify a mistake."""
@@ -104,8 +104,8 @@ class Cause:
             ratio is over the outputs' spread. Default: True.
 
     Example:
-        >>> print(Cause("k * u in the rate of v", "its sign seems wrong", 0.1, -1.02))
-        k * u in the rate of v: its sign seems wrong (factor -1.02); corrected, the error of free runs falls to 10 %
+        >>> print(Cause("k * u", "its sign seems wrong", 0.1, -1.02))
+        k * u: its sign seems wrong (factor -1.02); with the correction, the free-run error falls to 10 %
     """
 
     what: str
@@ -122,8 +122,8 @@ class Cause:
     def __str__(self) -> str:
         factor = "" if math.isnan(self.factor) else f" (factor {self.factor:.3g})"
         left = f"{100 * self.ratio:.0f} %"
-        told = f"falls to {left}" if self.before else f"is {left} of the outputs' spread"
-        return f"{self.what}: {self.why}{factor}; corrected, the error of free runs {told}"
+        change = f"falls to {left}" if self.before else f"is {left} of the outputs' spread"
+        return f"{self.what}: {self.why}{factor}; with the correction, the free-run error {change}"
 
 
 def reading_of(factor: float, needed: bool = True) -> str:
@@ -133,10 +133,10 @@ def reading_of(factor: float, needed: bool = True) -> str:
 
     Example:
         >>> reading_of(-1.04), reading_of(0.001), reading_of(0.001, needed=False), reading_of(1.1)
-        ('its sign seems wrong', 'it is 1e3 times too large, as between units', 'it seems not to exist', '')
+        ('its sign seems wrong', 'the value is 1e3 times too large, as between units', 'the term seems superfluous', '')
     """
     if not needed:
-        return "it seems not to exist"
+        return "the term seems superfluous"
     if texts := _readings(factor):
         return ", or ".join(texts)
     if factor < 0.0:
@@ -450,7 +450,7 @@ def _lengths(fit: OutputFit, thetas: Sequence[Array], longest: float) -> list[fl
 
 def named(found: Sequence[Cause]) -> str:
     """Text of equally likely causes; empty without a cause."""
-    return "; or, as likely, ".join(str(one) for one in found)
+    return "; or, equally likely, ".join(str(one) for one in found)
 
 
 def causes(
@@ -760,15 +760,17 @@ def _signals(
         for j, signal in enumerate(signals):
             name = f"{kind} {signal.label}"
             if key == "y" and signal.lower < 0.0 < signal.upper:  # for an input, the factor covers this case
-                changes.append((name, "it seems to be counted the other way", _changed(key, j, j, -1.0)))
+                changes.append(
+                    (name, "the sign convention seems to be the opposite", _changed(key, j, j, -1.0))
+                )
             turn = turn_in(signal.unit) if key == "y" else None
             for off in () if turn is None else (turn / 2, turn / 4, -turn / 4):
-                why = f"{off:+.4g} {signal.unit} seems to be missing: the angle is counted from another zero"
+                why = f"an offset of {off:+.4g} {signal.unit} seems to be missing: the angle has another zero"
                 changes.append((name, why, _changed(key, j, j, 1.0, off)))
             changes += [
                 (
                     f"{kind}s {signal.label} and {other.label}",
-                    "they seem to be exchanged",
+                    "the two seem to be exchanged",
                     _changed(key, j, i, 1.0),
                 )
                 for i, other in enumerate(signals[:j])

@@ -124,9 +124,7 @@ class _Library:
         v_unit, q_unit = state.unit, state.unit.removesuffix("/s")
         at: dict[str, Any] = {"width": width, "place": place}
         yield laws.coulomb(own, weight("F_c", 1.0, positive=True, words="dry friction"), **at)
-        yield laws.asymmetric(
-            own, weight("F_a", 1.0, words="dry friction forwards more than backwards"), **at
-        )
+        yield laws.asymmetric(own, weight("F_a", 1.0, words="direction dependence of dry friction"), **at)
         yield laws.viscous(own, weight("d", speed, (v_unit,), True, "viscous friction"), place=place)
         yield laws.viscous_by_direction(
             own, weight("d_a", speed, (v_unit,), words="viscous friction by direction"), place=place
@@ -151,7 +149,7 @@ class _Library:
         sizes: tuple[float, float] = (0.7, 0.7) if turning else (span, span**2)
         per: tuple[tuple[str, ...], ...] = ((), ()) if turning else ((q_unit,), (q_unit, q_unit))
         names = [
-            weight(f"F_{k}", size, p, words="dry friction along the way")
+            weight(f"F_{k}", size, p, words="position dependence of dry friction")
             for k, size, p in zip((1, 2), sizes, per, strict=True)
         ]
         if turning or not self.prior.states[q].periodic:  # the term's sine is that of radians
@@ -326,7 +324,7 @@ class _Library:
         yield laws.input_gain(own, of("g", 0.9, words="relative error of the gain"))
         yield laws.input_offset(own, of("o", 2 * spread, signal.unit, "offset of the input"))
         if (values < 0).any() and (values > 0).any():
-            yield laws.gain_by_direction(own, of("g_a", 0.9, words="gain forwards more than backwards"))
+            yield laws.gain_by_direction(own, of("g_a", 0.9, words="direction dependence of the gain"))
             yield laws.dead_zone(own, of("z", spread, signal.unit, "dead zone", True), width=0.05 * spread)
         size = float(np.abs(values).max())
         k = Parameter(
@@ -342,7 +340,7 @@ class _Library:
         # slope of the curve: 1 + 2 c |u - middle| / span
         farthest = max(abs(end - middle) for end in _ends(signal, values))
         least = -min(0.5, 0.5 * STEEP * span / farthest)
-        bend = Parameter(f"g_c_{own}", 0.0, "-", least, 0.5, "bend of the input")
+        bend = Parameter(f"g_c_{own}", 0.0, "-", least, 0.5, "curvature of the input characteristic")
         yield laws.input_curve(own, bend, centre=middle, span=span)
 
     def _output(self, i: int, signal: Signal) -> Iterator[Term | Candidate]:
@@ -363,7 +361,7 @@ class _Library:
         low, high = (float(v) for v in np.quantile(y, (0.0, 1.0)))
         # slope of the curve: 1 + bend (2 y - low - high)
         farthest = max(abs(2 * end - low - high) for end in _ends(signal, y))
-        bend = of("s_b", STEEP / farthest, over("1", unit), "bend of the sensor")
+        bend = of("s_b", STEEP / farthest, over("1", unit), "curvature of the sensor characteristic")
         yield laws.output_curve(own, bend, lower=low, upper=high)
 
 

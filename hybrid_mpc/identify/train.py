@@ -500,15 +500,15 @@ def load_checkpoint(path: Path, key: str) -> tuple[dict[str, Tensor], dict[str, 
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(
-            f"checkpoint {path} cannot be read ({error}); delete it to train anew [HM-IDENTIFY-053]"
+            f"checkpoint {path} cannot be read ({error}); delete this file to train again [HM-IDENTIFY-053]"
         ) from error
     numbers = metadata.get("numbers", "")
     if metadata.get("sha256") != _content_hash(tensors, numbers):
-        raise InputError(f"checkpoint {path} is damaged; delete it to train anew [HM-IDENTIFY-054]")
+        raise InputError(f"checkpoint {path} is damaged; delete this file to train again [HM-IDENTIFY-054]")
     if metadata.get("key") != key:
         raise InputError(
-            f"checkpoint {path} belongs to a training with other settings or data; "
-            f"resume with the same ones or choose another output folder [HM-IDENTIFY-055]"
+            f"checkpoint {path} belongs to a training with other settings or data; resume with the same settings and "
+            "data, or choose another output folder [HM-IDENTIFY-055]"
         )
     return tensors, json.loads(numbers)
 

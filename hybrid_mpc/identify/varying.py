@@ -1,7 +1,7 @@
 """Parameters that differ between recordings: a mixed-effects fit around the fitted prior.
 
 Parameter j of recording r is ``theta_j + b_rj`` with ``b_rj ~ N(0, omega_j^2)``. Each recording has a Gauss-Newton
-approximation of its own likelihood from free runs with free first states; the deviations ``b`` and the means are
+approximation of its own likelihood from free runs with free initial states; the deviations ``b`` and the means are
 eliminated exactly, and the variances ``omega^2`` maximise what remains, the evidence. A parameter enters only if it
 raises the evidence, so a parameter that the recordings do not identify stays fixed.
 
@@ -34,7 +34,8 @@ from hybrid_mpc.machine.prior import Prior
 
 Array = NDArray[np.float64]
 WINDOWS_OF_EACH = 4
-"""Windows of a recording at least: each has one free first state, and a single window tells little beside it."""
+"""Windows of a recording at least: each has one free initial state, so a single window contains little information
+about the parameters."""
 BLOCKS = 4
 """Blocks into which a single recording is cut: their scatter replaces that between recordings."""
 SHORTEST = 8
@@ -85,7 +86,7 @@ class VaryingParameter:
         return self.std > 0
 
     def tracked(self, std: float | None = None) -> TrackedParameter:
-        """What an observer needs to track it, with :attr:`std`, or with another one [unit]."""
+        """The parameter as an observer tracks it, with :attr:`std` or another standard deviation [unit]."""
         own = self.std if std is None else std
         return TrackedParameter(self.name, own / abs(self.value) if self.relative else own, self.relative)
 
@@ -99,7 +100,7 @@ class Varying:
         pieces: Number of recordings, or of blocks of a single recording.
         blocks: Whether the pieces are blocks of a single recording. They show the variation within it, not that between
             days.
-        reason: Why nothing could be said; empty if something could.
+        reason: Why there is no result; empty if there is one.
     """
 
     parameters: tuple[VaryingParameter, ...]
@@ -126,8 +127,8 @@ def find_varying(
 ) -> Varying:
     """Find the parameters that differ between recordings, with the standard deviations of their differences.
 
-    Pieces of one file are one recording. Of a single recording blocks are compared. The errors of free runs are
-    correlated; their likelihood is tempered by their correlation time.
+    Pieces of one file are one recording. A single recording is cut into blocks, which are compared. The errors of free
+    runs are correlated; their likelihood is tempered by their correlation time.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
@@ -153,7 +154,7 @@ def find_varying(
     if periods < SHORTEST:
         raise InputError(
             f"varying parameters: the shortest recording has {min(longest)} samples, but at least "
-            f"{WINDOWS_OF_EACH * SHORTEST} are needed. Leave it out [HM-IDENTIFY-078]"
+            f"{WINDOWS_OF_EACH * SHORTEST} are needed. Remove this recording [HM-IDENTIFY-078]"
         )
     theta = of.scaled(fit.values)
     relative = np.array([is_relative(p) for p in of.free])

@@ -138,7 +138,7 @@ class OutputWindows:
         return replace(self, y=y, u=self.u[:, : self.lead + periods + 1], w=w, censored=censored)
 
     def times(self, n: int) -> OutputWindows:
-        """Repeat the windows ``n`` times, one behind the other."""
+        """Repeat the windows ``n`` times, one after the other."""
         keys = ("y", "u", "w", "x", "censored", "known")
         every: dict[str, Any] = {key: np.concatenate([getattr(self, key)] * n) for key in keys}
         group = np.concatenate([self.group + i * (self.group.max() + 1) for i in range(n)])

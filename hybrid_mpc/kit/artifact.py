@@ -330,7 +330,7 @@ class Kit:
         """
         if self.promised is None:
             return none_made(
-                "this kit holds no table of promises: an older version made it, or its run did not finish the stage "
+                "this kit contains no table of promises: an older version made it, or its run did not finish the stage "
                 "promises"
             )
         if self.promised.of != self.identity:
@@ -553,8 +553,8 @@ class Kit:
         prior, hybrid = self._model("prior"), self._model("hybrid")
         if share is None and self.recommended != "hybrid":
             raise InputError(
-                f"{self._whose}: the prior is recommended, so nothing shows that the correction helps, and a blend may "
-                "do harm (docs/results/tracking.md). Use kit.observer(), or give share= [HM-KIT-042]"
+                f"{self._whose}: the prior is recommended: no evidence shows that the correction helps, and a blend "
+                "may be worse (docs/results/tracking.md). Use kit.observer(), or give share= [HM-KIT-042]"
             )
         share = BLEND_SHARE.value if share is None else share
         if not 0.0 < share < BLEND_SHARE.upper:
@@ -566,9 +566,8 @@ class Kit:
     def _tracked(self) -> tuple[TrackedParameter, ...]:
         if not self.loop.tracked:
             raise InputError(
-                f"{self._whose}: no parameter is tracked, since tracking does not improve its predictions, or nothing "
-                "was found yet. Use kit.observer(), or name parameters: kit.with_tracked([TrackedParameter(...)]) "
-                "[HM-KIT-040]"
+                f"{self._whose}: no parameter is tracked: tracking does not improve the predictions, or was not "
+                "tested. Use kit.observer(), or name parameters: kit.with_tracked([TrackedParameter(...)]) [HM-KIT-040]"
             )
         return self.loop.tracked
 

@@ -202,7 +202,7 @@ def _ask_for_point(model: HybridModel) -> str:
     if model.x0.any() or model.u0.any():
         return ""
     return (
-        "All states and inputs are zero there: declare the point at which the machine works in the prior, "
+        "All states and inputs are zero at this point: declare the operating point of the machine in the prior, "
         "operating_point = OperatingPoint(x=(...), u=(...)). "
     )
 
@@ -299,7 +299,7 @@ def _check_found(modes: Sequence[ExtendedKalmanFilter], periods: int, sizes: Arr
     )
     noise = ", ".join(f"{s.name} {v:.3g} {s.unit}" for s, v in zip(model.states, sigma, strict=False))
     raise InputError(
-        f"observer of model {model.name}: it never estimates a load at {where}, because its process noise ({noise} a "
+        f"observer of model {model.name}: a load at {where} is never estimated, because the process noise ({noise} per "
         "period) explains every load. A constant load would cause an offset. Correct the prior, set "
         "Scenario(state_noise={...}), or run the scenario again [HM-KIT-013]"
     )
@@ -599,8 +599,8 @@ def adaptable(model: HybridModel, causes: Mapping[str, Sequence[str]]) -> dict[s
         )
     if model.delay_states:
         raise InputError(
-            f"adaptive guard: model {model.name} has delayed inputs, which it does not support. Use guard rest or prior"
-            " [HM-KIT-022]"
+            f"adaptive guard: model {model.name} has delayed inputs, which the adaptive guard does not support. Use "
+            "guard rest or prior [HM-KIT-022]"
         )
     others = {
         name: names

@@ -237,7 +237,7 @@ class GuardedController:
         on = alarm == t or t - alarm < guard.quiet - TINY
         if frozen == t or t - frozen < guard.quiet - TINY:
             names = ", ".join(getattr(reading, "frozen_outputs", ()))
-            why = "the sensor repeats itself while motion is predicted" + (f": {names}" if names else "")
+            why = "the sensor repeats its value while motion is predicted" + (f": {names}" if names else "")
             wanted = guard.on_sensor
         elif on and alarm - doubt >= guard.patience - TINY:
             blind = getattr(reading, "blind", False)

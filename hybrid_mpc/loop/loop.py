@@ -195,7 +195,7 @@ class Loop:
         _check_models(self.model, safe.controller.model)
         _check_monitor(monitor, self.model)
         if guard is not None and monitor is None:
-            raise InputError("guard: it reacts to alarms of a monitor; give monitor=, too [HM-LOOP-019]")
+            raise InputError("guard: a guard reacts to alarms of a monitor; give monitor=, too [HM-LOOP-019]")
         self._estimator, self._safe, self._monitor = estimator, safe, monitor
         self._control = GuardedController(safe, guard)
         self._delay = whole_periods(input_delay, "input_delay")
@@ -615,8 +615,8 @@ def _check_state(state: LoopState, model: HybridModel, ocp: OCP, monitor: Monito
     ]
     if (state.monitor is None) != (monitor is None):
         wrong.append(
-            f"its loop had {'no' if state.monitor is None else 'a'} monitor, this one has {'a' if monitor else 'no'}"
-            " [HM-LOOP-029]"
+            f"the state is of a loop with {'no' if state.monitor is None else 'a'} monitor, this loop has "
+            f"{'a' if monitor else 'no'} [HM-LOOP-029]"
         )
     if wrong:
         raise InputError(

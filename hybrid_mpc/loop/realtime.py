@@ -345,7 +345,7 @@ class RunnerStep:
         estimate: The estimate.
         decision: The input and its source.
         reading: The monitor's reading; None without a monitor.
-        lateness: Delay of the period's begin behind the grid.
+        lateness: Delay of the period's start relative to the grid.
         applied: Time from the grid until the input has been applied.
         spent: Durations by the names of ``TIMED``.
     """
@@ -380,7 +380,7 @@ class RunReport:
         x_hat: Estimated states ``(n, n_x)``.
         source: Name of the source of each input.
         status: Name of the :class:`~hybrid_mpc.control.problem.Status` of each solve.
-        lateness_ms: Delay of each period's begin behind the grid ``(n,)`` [ms].
+        lateness_ms: Delay of each period's start relative to the grid ``(n,)`` [ms].
         applied_ms: Time from the grid until each input has been applied ``(n,)`` [ms].
         timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``, ``prepare``.
         alarm: ``(n,)``, True while the monitor alarms.

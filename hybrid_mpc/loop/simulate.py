@@ -278,7 +278,7 @@ def _end(dt: float, duration: float, period: float) -> float:
         )
     if not abs(dt - period) <= 1e-9 * period:
         raise InputError(
-            f"dt: got {dt} s, but the models' period is {period} s; give this period [HM-LOOP-048]"
+            f"dt: got {dt} s, but the model period is {period} s; give this period [HM-LOOP-048]"
         )
     if duration / dt > MOST_PERIODS:
         raise InputError(

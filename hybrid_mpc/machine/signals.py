@@ -62,13 +62,13 @@ class Signal:
         )  # fmt: skip
         own.need(
             "saturation periodic", lambda: self.saturation is None or not self.periodic,
-            "a periodic signal cannot have a saturation, since its sensor restarts at a full turn. Leave one of them "
-            "out. [HM-MACHINE-021]",
+            "a periodic signal cannot have a saturation, since its sensor restarts at a full turn. Remove one of the "
+            "two. [HM-MACHINE-021]",
         )  # fmt: skip
         own.need(
             "unit periodic", lambda: not self.periodic or turn_in(self.unit) is not None,
             f"periodic=True needs a unit of angles, which gives the period (rad, deg, rev, turn), got {self.unit}. "
-            "Give the unit, or leave periodic out. [HM-MACHINE-047]",
+            "Give the unit, or omit periodic. [HM-MACHINE-047]",
         )  # fmt: skip
         own.refuse()
 

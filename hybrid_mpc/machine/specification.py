@@ -142,15 +142,15 @@ class DataSpec:
 
 @dataclass(frozen=True)
 class ChoiceRule:
-    """How sure held-out data must show that a hybrid has less error than the fitted prior, before it is recommended.
+    """Evidence on held-out data that is required to recommend a hybrid instead of the fitted prior.
 
     Args:
         confidence: One-sided probability with which the upper bound of the error ratio holds. Default: 0.95. If half a
-            correction is exactly as good as the prior, and all else is worse, it is taken in 6 % of the cases. With a
-            higher confidence the prior is recommended more often.
+            correction is exactly as good as the prior, and all else is worse, half the correction is recommended in 6 %
+            of the cases. With a higher confidence the prior is recommended more often.
         shares: Shares of a network's correction that are tried if the whole does not pass, the largest first. Default:
-            0.75 and 0.5. A model between prior and hybrid scatters less than either. A quarter alone passed in 3 of 45
-            checks on real machines, and had the prior's error there.
+            0.75 and 0.5. The error of a model between prior and hybrid varies less than that of either. A quarter alone
+            passed in 3 of 45 checks on real machines, with the error of the prior.
         fewest: Smallest number of recordings that give a bound. Default: 3. Two may agree by chance: on the temperature
             lab two did, and a hybrid with 1.3 to 1.4 times the prior's error was recommended.
 
@@ -218,9 +218,9 @@ class BenchmarkSpec:
         piece: Length [s] of the pieces into which long training recordings are cut. Default: 25 s.
         cycle: Roles of these pieces, repeated in order of time, for recordings whose last parts are not representative.
             Default: none, the data specification splits.
-        valid_every: Every so many-th of several training files, in order of their names, is used as a whole for
-            validation, the others for training. For short runs whose last second is not representative. The files must
-            not have windows in the data specification, which also splits fewer files. Default: zero, never.
+        valid_every: Every ``valid_every``-th training file, in order of their names, is used as a whole for validation,
+            the others for training. For short runs whose last second is not representative. The files must not have
+            windows in the data specification, which also splits fewer files. Default: zero, never.
         fractions: Shares of training, validation and held-back samples. A benchmark has test files of its own, while
             the main job needs a part for evaluation. Default: those of the data specification.
 

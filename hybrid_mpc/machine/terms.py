@@ -1,9 +1,9 @@
-"""Physical terms that any prior can be given beside what it has: friction, losses, curved inputs and sensors, lags.
+"""Physical terms that can be added to any prior: friction, losses, curved characteristics of inputs and sensors, lags.
 
-A :class:`Term` is a change of a prior with one to three parameters, which vanishes where these are zero.
-:func:`extended` gives the prior with terms: it is fitted, trained on, exported and controlled like any other, and its
-balances have what the terms store, supply and lose. What laws are known stands here as one function each; which of them
-a prior may lack, with bounds from its recordings, says :func:`hybrid_mpc.identify.explain.library`.
+A :class:`Term` changes a prior by one to three parameters; it has no effect if they are zero. :func:`extended` gives
+the prior with terms, which is used like any other prior; its balances contain what the terms store, supply and lose.
+Each law is a function of this module. The laws that a prior may lack, with bounds from its recordings, are chosen by
+:func:`hybrid_mpc.identify.term_library.library`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Made:
 
 
 def again(made: Made) -> Term:
-    """The term of a call that was written as data.
+    """Create the term of a call that was stored as data.
 
     Raises:
         InputError: If there is no such function.
@@ -76,7 +76,7 @@ def again(made: Made) -> Term:
 
 
 class At(NamedTuple):
-    """What a law is a function of.
+    """Arguments of a law.
 
     Attributes:
         x: States of the prior, by name.
@@ -84,10 +84,10 @@ class At(NamedTuple):
         w: Measured disturbances, by name.
         p: Parameters of the prior, by name.
         own: The signal that the term changes: the state whose rate or force it adds to, the input or output itself.
-        position: The position whose speed :attr:`own` is; None where there is none.
-        driven: Force or rate by what the inputs do [unit of the force or rate], less what they do at rest.
-        resting: Force or rate of the machine at rest where it is, as that of gravity or a spring.
-        state: The term's own state; None where it has none.
+        position: The position whose speed is :attr:`own`; None if :attr:`own` is not a speed.
+        driven: Force or rate due to the inputs, minus that of the inputs at rest [unit of the force or rate].
+        resting: Force or rate at the present position without motion, e.g. of gravity or a spring.
+        state: The term's own state; None without one.
     """
 
     x: Any
@@ -112,25 +112,25 @@ class At(NamedTuple):
 
 @dataclass(frozen=True)
 class Term:
-    """A change of a prior.
+    """A physical term: a change of a prior.
 
     Args:
         name: Name of the term, e.g. ``"Coulomb friction of phi_dot"``.
-        place: Where it stands: ``"force"`` adds a generalised force to a mechanical prior's speed ``of``,
+        place: Place in the prior: ``"force"`` adds a generalised force to a mechanical prior's speed ``of``,
             ``"potential"`` an energy of its position, ``"rate"`` adds to the rate of the state ``of``; ``"input"``,
-            ``"disturbance"`` and ``"output"`` replace what acts or is shown.
+            ``"disturbance"`` and ``"output"`` replace the acting or the measured signal.
         of: Name of the speed, state, input, disturbance or output.
-        parameters: Its parameters; at zero of the first one, or at its nominal value, it hardly acts.
+        parameters: Its parameters; the term has almost no effect if the first one is zero, or at its nominal value.
         law: ``(at, p) -> value``: the force or rate that is added, the energy, or the signal in place of ``at.own``.
             With a state ``(value, rate)``. ``p`` are its parameters in order, by name.
         text: Its formula.
-        loss: Whether what it does to a balance is a loss, as friction; else it is a supply. Default: a supply.
-        state: A state of its own, e.g. that of a lag; its nominal value is that of the signal. Default: none.
-        explanation: What it is, in one sentence for tables.
-        made: The call that makes it, of a law of this module. Default: none.
+        loss: Whether the term is a loss of a balance, like friction. Default: it is a supply.
+        state: An additional state, e.g. of a lag; its nominal value is that of the signal. Default: none.
+        explanation: Description in one sentence, for tables.
+        made: The call of a law of this module that creates the term. Default: none.
 
     Raises:
-        InputError: If a field is of another kind, or it has no parameter.
+        InputError: If a field has a wrong type, or the term has no parameter.
 
     Example:
         >>> leak = Term("leak", "rate", "level", (Parameter("leak", 0.0, "1/s", 0.0, 1.0),),
@@ -155,7 +155,7 @@ class Term:
         own.need(
             "place",
             lambda: self.place in PLACES,
-            f"place {self.place!r} is none of {', '.join(PLACES)} [HM-MACHINE-031]",
+            f"place {self.place!r} is unknown; choose from {', '.join(PLACES)} [HM-MACHINE-031]",
         )
         own.need("parameters", lambda: len(self.parameters) > 0, "a term needs a parameter [HM-MACHINE-032]")
         own.refuse()
@@ -167,20 +167,21 @@ class Term:
 
     @property
     def code(self) -> str:
-        """The call that makes it, for a file; empty for an own term."""
+        """Code of the call that creates the term; empty for a user's own term."""
         return "" if self.made is None else self.made.code
 
 
 def extended(base: type[Prior], *terms: Term) -> type[Prior]:
-    """A prior class with terms beside what ``base`` has; their parameters and states come after those of ``base``.
+    """Create a prior class with additional terms; their parameters and states come after those of ``base``.
 
     Args:
-        base: A prior, in CasADi or torch; an extended one too.
+        base: A prior class in CasADi or torch; it may have terms already.
         terms: Terms, in any order. Default: none, ``base`` itself.
 
     Raises:
-        InputError: If a term's signal is not there, a parameter or state is there twice, a force is added to a
-            prior that is not mechanical, the units do not fit, or a potential is none; all of it together.
+        InputError: With all problems: a signal of a term is missing, a parameter or state appears twice, a force is
+            added to a prior that is not mechanical, units do not match, or a potential depends on more than its
+            position.
 
     Example:
         >>> class Disk(MechanicalPrior):
@@ -205,15 +206,15 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
 def with_nominal(
     prior: type[Prior], values: Mapping[str, float], operating_point: OperatingPoint | None = None
 ) -> type[Prior]:
-    """A prior class with other nominal parameters, e.g. fitted ones; of an extended prior those of its terms, too.
+    """Create a prior class with other nominal parameters, e.g. fitted ones, including those of its terms.
 
     Args:
-        prior: A prior; an extended one too.
-        values: Nominal values [their units] by name. Parameters that are not named keep theirs.
-        operating_point: The equilibrium with these values, states of terms included. Default: the prior's.
+        prior: A prior class; it may have terms.
+        values: Nominal values [their units] by name. Other parameters keep their values.
+        operating_point: The equilibrium with these values, including the states of terms. Default: the prior's.
 
     Raises:
-        InputError: If a name is no parameter, or a value lies outside the prior's bounds.
+        InputError: If a name is not a parameter, or a value lies outside the prior's bounds.
 
     Example:
         >>> class Decay(Prior):
@@ -258,7 +259,7 @@ def _beyond(base: Any, values: Mapping[str, float]) -> Iterator[str]:
             yield (
                 f"with_nominal: {p.name} = {value:g} {p.unit} lies outside [{p.lower:g}, {p.upper:g}]: {where} {what}. "
                 f"Leave {p.name} out of the values to keep {p.value:g} (in a file of hybrid-mpc explain: delete its "
-                f"line of FITTED), widen its bounds there, or run hybrid-mpc explain again with the new bounds "
+                "line of FITTED), widen its bounds there, or run hybrid-mpc explain again with the new bounds "
                 "[HM-MACHINE-046]"
             )
 
@@ -306,7 +307,7 @@ def _expressions(
     x_base, extra = x[:n_x], dict[Term, Any]()
 
     def applied(term: Term, own: Any, **more: Any) -> Any:
-        """What a law gives; the rate of its own state is kept."""
+        """Value of a law; the rate of its own state is stored."""
         point = At.of(prior, (x_base, u, w, of_base), own, state=states.get(term), **more)
         value = term.law(point, given[term])
         if term.state is not None:
@@ -359,7 +360,7 @@ def _expressions(
         storage = b.storage(x_base, of_base)
         slope = ca.gradient(storage, x_base)
         mechanical = issubclass(base, MechanicalPrior) and b.name == "energy"
-        # a potential's force only turns what is stored into another form: dS/dt of the sum has it on both sides
+        # the force of a potential only converts stored energy: it cancels in dS/dt of the total storage
         held = stored if mechanical else ca.SX(0)
         supply = (
             b.supply(x_base, u, w, of_base)
@@ -375,7 +376,7 @@ def _expressions(
 def _forces(
     base: type[Prior], x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX, term: Term, i: int
 ) -> tuple[ca.SX, ca.SX]:
-    """Force, or rate, of a state by the inputs and at rest."""
+    """Force or rate of a state due to the inputs, and at rest."""
     prior, n_x = base(), len(base.states)
     point = base.operating_point
     at_rest = ca.DM([0.0] * len(base.inputs) if point is None else list(point.u))
@@ -397,7 +398,7 @@ def _masses(base: Any) -> ca.Function:
 
 
 def _operating_point(base: type[Prior], terms: tuple[Term, ...]) -> OperatingPoint | None:
-    """The base's, with the states of terms where the signals that they follow are."""
+    """The operating point of the base; states of terms equal the signals that they follow."""
     point = base.operating_point
     if point is None or not any(term.state for term in terms):
         return point
@@ -416,7 +417,7 @@ def _operating_point(base: type[Prior], terms: tuple[Term, ...]) -> OperatingPoi
 
 
 def signals_at(base: type[Prior], place: str) -> tuple[Signal, ...]:
-    """The signals among which a term of a place has its own."""
+    """Signals that a term of this place can change."""
     found = {"input": base.inputs, "disturbance": base.disturbances, "output": base.outputs}
     return found.get(place, base.states)
 
@@ -429,13 +430,15 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
         names = [s.name for s in signals_at(base, term.place)]
         if term.of not in names:
             problems.append(
-                f"{where}: there is no {term.of!r}; choose of {', '.join(names)}. [HM-MACHINE-034]"
+                f"{where}: there is no {term.of!r}; choose from {', '.join(names)}. [HM-MACHINE-034]"
             )
         elif term.place in ("force", "potential") and not issubclass(base, MechanicalPrior):
-            problems.append(f"{where}: a {term.place} needs a MechanicalPrior; take a rate. [HM-MACHINE-035]")
+            problems.append(
+                f"{where}: a {term.place} needs a MechanicalPrior. Use place='rate'. [HM-MACHINE-035]"
+            )
         elif term.place in ("force", "potential") and term.of not in moving:
             problems.append(
-                f"{where}: {term.of!r} is no speed; choose of {', '.join(sorted(moving))}. [HM-MACHINE-036]"
+                f"{where}: {term.of!r} is no speed; choose from {', '.join(sorted(moving))}. [HM-MACHINE-036]"
             )
         if term.state is not None and term.place in ("force", "potential"):
             problems.append(f"{where}: a {term.place} cannot have a state of its own. [HM-MACHINE-037]")
@@ -448,13 +451,13 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
         twice = sorted({name for name in every if every.count(name) > 1})
         if twice:
             problems.append(
-                f"{base.__name__} with terms: {what} {', '.join(twice)} occur twice; rename one. [HM-MACHINE-038]"
+                f"{base.__name__} with terms: {what} {', '.join(twice)} appear twice. Rename one. [HM-MACHINE-038]"
             )
     refuse(problems)
 
 
 def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
-    """Why a term's law cannot stand where it is: its units, or a potential of more than its position."""
+    """Why a term's law is invalid at its place: its units, or a potential that depends on more than its position."""
     where = f"term {term.name!r} for {base.__name__}"
     groups: dict[str, tuple[Signal | Parameter, ...]] = {
         "x": base.states, "u": base.inputs, "w": base.disturbances, "p": base.parameters,
@@ -497,17 +500,20 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
         parts = [(value[0], wanted), (value[1], term_units.per_second(term_units.of(term.state.unit)))]
     for one, needed in parts:
         if said := term_units.clash(one, inputs, needed):
-            yield f"{where}: units do not fit, {said}. Correct the unit of a parameter, or the law. [HM-MACHINE-042]"
+            yield f"{where}: units do not match: {said}. Correct the unit of a parameter, or the law. [HM-MACHINE-042]"
     if term.place == "potential":
         free = [
             v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not position
         ]
         if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
-            yield f"{where}: a potential is of its position alone, or the balance breaks; take a force [HM-MACHINE-043]"
+            yield (
+                f"{where}: a potential may only depend on its position, else the energy balance is wrong. Use a force "
+                "[HM-MACHINE-043]"
+            )
 
 
 def _uneven(term: Term) -> Term:
-    """The same law with other numbers: a factor of 1 or 2, whatever its unit, leaves no trace in an expression."""
+    """The same law with other numbers: a factor of 1 or 2 disappears from an expression, whatever its unit."""
     if term.made is None:
         return term
     options = {k: 1.2345 * v if type(v) is float else v for k, v in term.made.options.items()}
@@ -577,7 +583,7 @@ def coulomb(of: str, level: Parameter, *, width: float, place: Place = "force") 
 
 
 def asymmetric(of: str, more: Parameter, *, width: float, place: Place = "force") -> Term:
-    """Dry friction that is larger forwards than backwards: ``-A tanh(v / width)^2``.
+    """Dry friction that depends on the direction: ``-A tanh(v / width)^2``.
 
     Args:
         of: Speed.
@@ -616,7 +622,7 @@ def quadratic(of: str, c: Parameter, *, place: Place = "force") -> Term:
 
 
 def stribeck(of: str, more: Parameter, *, speed: float, width: float, place: Place = "force") -> Term:
-    """More friction near rest than in motion: ``-F exp(-(v / speed)^2) tanh(v / width)``.
+    """Friction that is larger near rest than in motion: ``-F exp(-(v / speed)^2) tanh(v / width)``.
 
     Source: Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey of models, analysis tools and compensation methods for
     the control of machines with friction*, Automatica 30 (1994).
@@ -631,7 +637,7 @@ def stribeck(of: str, more: Parameter, *, speed: float, width: float, place: Pla
 def loaded(of: str, mu: Parameter, *, load: str, width: float, place: Place = "force") -> Term:
     """Friction that grows with the load of a gear or bearing: ``-mu |load| tanh(v / width)``.
 
-    ``load`` is ``"driven"`` (what the inputs do), ``"resting"`` (gravity, springs) or ``"both"``, their sum.
+    ``load`` is ``"driven"`` (the effect of the inputs), ``"resting"`` (gravity, springs) or ``"both"``, their sum.
 
     Source: Duclusaud, Passault, Padois, Ly, *Extended friction models for the physics simulation of servo actuators*
     (ICRA 2025).
@@ -656,8 +662,8 @@ def coulomb_by_position(
     centre: float = 0.0,
     place: Place = "force",
 ) -> Term:
-    """Dry friction that changes along the way: ``-(a sin q + b cos q) tanh(v / width)``, or with ``q - centre`` and its
-    square where the position does not turn.
+    """Dry friction that depends on the position: ``-(a sin q + b cos q) tanh(v / width)``, or with ``q - centre`` and
+    its square for a position that does not turn.
     """
     first, second = (ca.sin, ca.cos) if turning else (lambda q: q - centre, lambda q: (q - centre) ** 2)
     return _added(
@@ -677,7 +683,7 @@ def offset(of: str, value: Parameter, *, place: Place = "force") -> Term:
 
 
 def gravity_error(of: str, sine: Parameter, cosine: Parameter) -> Term:
-    """A weight that is missing in the prior, or acts at another angle: the potential ``-a cos q + b sin q``."""
+    """A weight that is missing in the prior, or acts at a different angle: the potential ``-a cos q + b sin q``."""
     return _added(
         "gravity_error", "gravity error", "potential", of, (sine, cosine),
         lambda at, p: -p[0] * ca.cos(at.position) + p[1] * ca.sin(at.position),
@@ -686,8 +692,8 @@ def gravity_error(of: str, sine: Parameter, cosine: Parameter) -> Term:
 
 
 def cogging(of: str, sine: Parameter, cosine: Parameter, *, periods: float) -> Term:
-    """Magnets on teeth, or a shaft that is not round: the potential ``(a cos(n q) - b sin(n q)) / n``, n the periods in
-    2 pi of the position.
+    """Cogging of magnets on teeth, or an eccentric shaft: the potential ``(a cos(n q) - b sin(n q)) / n``, with n
+    periods in 2 pi of the position.
     """
     return _added(
         "cogging", f"cogging by {periods:.3g}", "potential", of, (sine, cosine),
@@ -705,12 +711,12 @@ def spring(of: str, stiffness: Parameter, *, centre: float) -> Term:
 
 
 def elastic_end(of: str, stiffness: Parameter, *, edge: float, upper: bool) -> Term:
-    """An elastic stop: the potential ``k max(q - edge, 0)^2 / 2``, of a lower end ``edge - q``."""
+    """An elastic stop: the potential ``k max(q - edge, 0)^2 / 2``, with ``edge - q`` for a lower end."""
     side = 1.0 if upper else -1.0
     return _added(
         "elastic_end", f"{'upper' if upper else 'lower'} elastic end", "potential", of, (stiffness,),
         lambda at, p: 0.5 * p[0] * ca.fmax(side * (at.position - edge), 0.0) ** 2,
-        f"-{stiffness.name} (q - {edge:.3g}) beyond it", edge=edge, upper=upper,
+        f"-{stiffness.name} (q - {edge:.3g}) beyond this edge", edge=edge, upper=upper,
     )  # fmt: skip
 
 
@@ -718,7 +724,7 @@ def elastic_end(of: str, stiffness: Parameter, *, edge: float, upper: bool) -> T
 
 
 def _from(of: str, centre: str) -> str:
-    """A signal's distance from a centre, in words; the signal alone where that is zero.
+    """A signal's distance from a centre, in words; the signal alone if the centre is zero.
 
     Example:
         >>> _from("speed", "0"), _from("water", "21")
@@ -741,11 +747,11 @@ def _power(x: str, exponent: float) -> str:
 
 
 def loss(of: str, k: Parameter, n: Parameter, *, scale: float, reference: str | float = 0.0) -> Term:
-    """A loss to what surrounds it: ``-k (x - r) |(x - r) / scale|^(n - 1)``.
+    """A loss to the surroundings: ``-k (x - r) |(x - r) / scale|^(n - 1)``.
 
     Args:
         of: State.
-        k: Loss rate [1/s] where the state is ``scale`` away from the reference.
+        k: Loss rate [1/s] at a distance of ``scale`` from the reference.
         n: Exponent: 1 for conduction, 1.25 to 1.33 for free convection, 0.5 for an outlet.
         scale: Distance from the reference [unit of the state], that of the recordings.
         reference: The state or measured disturbance of the same unit on the other side, or a number.
@@ -793,7 +799,7 @@ def _kelvin(of: str, kelvin: float) -> str:
 
 
 def storage(of: str, k: Parameter, tau: Parameter, *, state: Signal) -> Term:
-    """A second capacity beside a state, as a wall's heat: ``k (s - x)`` with ``tau s' = x - s``."""
+    """A second capacity next to a state, such as a wall: ``k (s - x)`` with ``tau s' = x - s``."""
     return _added(
         "storage", "second capacity", "rate", of, (k, tau),
         lambda at, p: (p[0] * (at.state - at.own), (at.own - at.state) / p[1]),
@@ -839,7 +845,7 @@ def _signal(at: At, name: str) -> Any:
 
 
 def input_gain(of: str, g: Parameter) -> Term:
-    """Another gain: ``(1 + g) u``."""
+    """A different gain: ``(1 + g) u``."""
     return _added(
         "input_gain", "gain", "input", of, (g,), lambda at, p: (1.0 + p[0]) * at.own, f"(1 + {g.name}) {of}"
     )
@@ -862,7 +868,7 @@ def gain_by_direction(of: str, b: Parameter) -> Term:
 
 
 def input_curve(of: str, c: Parameter, *, centre: float, span: float) -> Term:
-    """A bent characteristic: ``u + c (u - centre) |u - centre| / span``; negative ``c`` saturates.
+    """A curved characteristic: ``u + c (u - centre) |u - centre| / span``; negative ``c`` saturates.
 
     It reverses where ``2 c |u - centre| < -span``: bound ``c`` by the input's range.
     """
@@ -882,9 +888,9 @@ def saturation(of: str, k: Parameter) -> Term:
 
 
 def dead_zone(of: str, d: Parameter, *, width: float) -> Term:
-    """An input that must be this large before it acts, by
-    ``u - (sqrt((u + d)^2 + width^2) - sqrt((u - d)^2 + width^2)) / 2``: ``u - d`` far above ``d``, ``u + d`` far below
-    ``-d``.
+    """A dead zone: ``u - (sqrt((u + d)^2 + width^2) - sqrt((u - d)^2 + width^2)) / 2``.
+
+    Small inputs have no effect. The result is nearly ``u - d`` far above ``d``, and ``u + d`` far below ``-d``.
     """
 
     def law(at: At, p: Any) -> Any:
@@ -902,7 +908,7 @@ def dead_zone(of: str, d: Parameter, *, width: float) -> Term:
 
 
 def input_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
-    """An actuator that follows its command: ``tau s' = u - s``, and ``s`` acts."""
+    """An actuator lag: ``tau s' = u - s``, and ``s`` acts."""
     return _added(
         "input_lag", "lag", "input", of, (tau,), lambda at, p: (at.state, (at.own - at.state) / p[0]),
         f"{tau.name} s' = {of} - s", state=state,
@@ -910,7 +916,7 @@ def input_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
 
 
 def input_delay(of: str, tau: Parameter, *, state: Signal) -> Term:
-    """An input that acts later: ``2 s - u`` with ``tau s' = 2 (u - s)``, the Padé approximation of first order.
+    """An input delay: ``2 s - u`` with ``tau s' = 2 (u - s)``, the Padé approximation of first order.
 
     Source: K. Ogata, *Modern Control Engineering*, 5th edition (2010), section 5.5.
     """
@@ -924,7 +930,7 @@ def input_delay(of: str, tau: Parameter, *, state: Signal) -> Term:
 
 
 def disturbance_gain(of: str, g: Parameter, *, centre: float = 0.0) -> Term:
-    """A measured disturbance that does more, or less, than the prior has: ``w + g (w - centre)``."""
+    """A measured disturbance with a different gain: ``w + g (w - centre)``."""
     return _added(
         "disturbance_gain", "gain of the disturbance", "disturbance", of, (g,),
         lambda at, p: at.own + p[0] * (at.own - centre), f"{of} + {g.name} ({of} - {centre:.3g})", centre=centre,
@@ -951,7 +957,7 @@ def disturbance_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
 
 
 def output_gain(of: str, g: Parameter) -> Term:
-    """A sensor of another gain: ``(1 + g) y``."""
+    """A sensor with a different gain: ``(1 + g) y``."""
     return _added(
         "output_gain", "sensor gain", "output", of, (g,), lambda at, p: (1.0 + p[0]) * at.own,
         f"(1 + {g.name}) {of}",
@@ -967,7 +973,7 @@ def output_offset(of: str, value: Parameter) -> Term:
 
 
 def output_curve(of: str, bend: Parameter, *, lower: float, upper: float) -> Term:
-    """A bent sensor that is right at two readings: ``y + bend (y - lower) (y - upper)``.
+    """A curved sensor that is exact at two values: ``y + bend (y - lower) (y - upper)``.
 
     It reverses where ``bend (2 y - lower - upper) < -1``: bound ``bend`` by the output's range.
     """
@@ -979,7 +985,7 @@ def output_curve(of: str, bend: Parameter, *, lower: float, upper: float) -> Ter
 
 
 def output_lag(of: str, tau: Parameter, *, state: Signal) -> Term:
-    """A sensor that follows what it measures, or averages it: ``tau s' = y - s``, and ``s`` is shown."""
+    """A sensor lag, or an averaging sensor: ``tau s' = y - s``, and ``s`` is measured."""
     return _added(
         "output_lag", "sensor lag", "output", of, (tau,), lambda at, p: (at.state, (at.own - at.state) / p[0]),
         f"{tau.name} s' = {of} - s", state=state,
@@ -1001,14 +1007,14 @@ EXPLANATIONS: Mapping[str, str] = {
     "loaded": "Dry friction grows with the load of a gear or bearing.",
     "coulomb_by_position": "Dry friction depends on the position.",
     "offset": "A constant force or rate acts all the time.",
-    "gravity_error": "The weight, its lever arm or its angle differs from the prior's.",
-    "cogging": "A torque is periodic in the position: cogging, or a shaft that is not round.",
+    "gravity_error": "Weight, lever arm or angle of gravity differ from the prior.",
+    "cogging": "A torque is periodic in the position: cogging, or an eccentric shaft.",
     "spring": "A spring, such as a cable or hose, pulls towards one position.",
     "elastic_end": "An elastic stop acts near the end of the travel.",
     "loss": "A loss to the surroundings or to another state.",
     "radiation": "Heat is lost by radiation.",
     "storage": "A second capacity, such as a wall, stores and releases with its own time constant.",
-    "overflow": "Above an edge, material overflows.",
+    "overflow": "Material overflows above an edge.",
     "coupling": "Another signal acts on the state.",
     "product": "The product of two signals acts on the state.",
     "input_gain": "The input's gain differs from the prior's.",
@@ -1027,4 +1033,4 @@ EXPLANATIONS: Mapping[str, str] = {
     "output_curve": "The sensor's characteristic is curved.",
     "output_lag": "The sensor, or its filter, follows with a time constant.",
 }
-"""What each law of this module is, in one sentence."""
+"""One sentence about each law of this module."""

@@ -66,9 +66,9 @@ def disturbance_matrices(
         chosen = [Disturbance("input", s.name) for s in inputs]
     if not chosen:
         raise InputError(
-            "disturbance model: it is empty. Leave out disturbance_model for one at each input, or name at least one "
-            "(as many as outputs give offset-free control): without any, an estimator takes every load for a motion."
-            " [HM-MODEL-005]"
+            "disturbance model: empty. Omit disturbance_model for one disturbance at each input, or name at least one "
+            "(as many as outputs give offset-free control). Without a disturbance, the estimator explains every load "
+            "as motion of the states. [HM-MODEL-005]"
         )
     places = {"input": (inputs, 1.0), "rate": (states, dt), "output": (outputs, 1.0)}
     if len({(d.at, d.signal) for d in chosen}) < len(chosen):

@@ -228,7 +228,7 @@ class SteadySearch:
     """Steady states closest to a set-point within bounds: ``min |y - goal|^2``, weighted, subject to ``rest(v) = 0``.
 
     A Gauss-Newton method that eliminates the steady-state equations by their null space; bounds are treated by an
-    active set. Of several equally good solutions the one closest to the operating point is taken, measured in the
+    active set. Among equally good solutions, the solution closest to the operating point is used, measured in the
     scales of the leaning unknowns. All quantities are scaled, so solutions do not depend on units.
 
     Args:

@@ -153,8 +153,9 @@ def remedy_for_unmoved(names: tuple[str, ...]) -> str:
         return ""
     name = names[0]
     return (
-        f"no input moves {', '.join(names)} and nothing brings it back. Let it return slowly to its usual value in "
-        f"xdot, e.g. (usual - x.{name}) / 86400 for one day in seconds, or make it a measured disturbance"
+        f"no input affects {', '.join(names)}, and the dynamics do not return to a steady value. Let the state return "
+        f"slowly to its usual value in xdot, e.g. (usual - x.{name}) / 86400 for one day in seconds, or make it a "
+        "measured disturbance"
     )
 
 

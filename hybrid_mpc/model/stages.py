@@ -173,6 +173,6 @@ def _compiled(stage: ca.Function) -> ca.Function:
             return compile_function(stage)
     except (RuntimeWarning, CompileError) as error:
         raise InputError(
-            f"compiled=True: the model could not be compiled: {error}. Install a C compiler (cc, gcc, clang or the "
-            "one named by the variable CC), or leave out compiled. [HM-MODEL-043]"
+            f"compiled=True: the model could not be compiled: {error}. Install a C compiler (cc, gcc, clang or the one "
+            "named by the variable CC), or omit compiled. [HM-MODEL-043]"
         ) from error

@@ -36,7 +36,7 @@ def history(states: Sequence[str], values: Sequence[float], *, base: float | Non
     best = np.minimum.accumulate([values[number] for number in done])
     ax.step(done, best, color=INK, linewidth=1.2, where="post", label="best so far")
     if base is not None:
-        ax.axhline(base, color=FAINT, linestyle="--", linewidth=1.2, label="settings it started from")
+        ax.axhline(base, color=FAINT, linestyle="--", linewidth=1.2, label="initial settings")
     ax.set_xlabel("trial [-]")
     ax.set_ylabel(LABEL)
     ax.xaxis.get_major_locator().set_params(integer=True)

@@ -1,1 +1,1 @@
-"""What watches a machine: readings of channels, their limits, alarms, and what explains these."""
+"""Monitoring of a machine: readings of channels, their limits, alarms, and their diagnosis."""

@@ -161,7 +161,7 @@ class WatchLimits:
         strange = [one.channel for one in self.channels if (one.channel, one.unit) not in known]
         if kind != self.kind or strange:
             raise InputError(
-                f"limits: they belong to {', '.join(strange) or self.kind}, but the readings are of {kind}: "
+                f"limits: learned for {', '.join(strange) or self.kind}, but the readings are of {kind}: "
                 f"{', '.join(c.name for c in channels)}. Learn the limits again with learn_limits [HM-WATCH-006]"
             )
         if wrong := [one.channel for one in self.channels if len(one.scale) not in (0, n_terms)]:
@@ -171,8 +171,8 @@ class WatchLimits:
         for what, own, given in (("a period", self.dt, dt), ("a time unit", self.time_unit, time_unit)):
             if abs(own - given) > 1e-9 * own:
                 raise InputError(
-                    f"limits: learned with {what} of {own:g} s, but that of the model is {given:g} s. Learn them again"
-                    " [HM-WATCH-008]"
+                    f"limits: learned with {what} of {own:g} s, but the model has {given:g} s. Learn the limits again "
+                    "[HM-WATCH-008]"
                 )
 
 

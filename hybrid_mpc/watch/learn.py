@@ -270,9 +270,9 @@ def check_nominal(maxima: Array, what: str, block_s: float = BLOCK_S) -> None:
     if odd.size:
         places = ", ".join(f"{i * block_s:g}" for i in odd[:5])
         raise InputError(
-            f"nominal data of {what}: they contain an alarm. Blocks of {block_s:g} s from {places} s stand out "
-            f"(up to {maxima.max():.3g}, nominal blocks stay below {limit:.3g}). Cut them out, or find the cause"
-            " [HM-WATCH-023]"
+            f"nominal data of {what} contain an alarm. Blocks of {block_s:g} s from {places} s stand out (up to "
+            f"{maxima.max():.3g}, nominal blocks stay below {limit:.3g}). Remove these blocks, or find the cause "
+            "[HM-WATCH-023]"
         )
 
 

@@ -124,8 +124,8 @@ class Monitor:
         if self.limits is not None or np.isfinite(self.frozen_travel).any():
             return ""
         return (
-            "it has no limits, so only missing readings raise an alarm. Use kit.monitor(), whose limits the stage "
-            "watch of a run learns"
+            "the monitor has no limits, so only missing readings raise an alarm. Use kit.monitor(), which has the "
+            "limits learned in stage watch of a run"
         )
 
     def initial(self) -> MonitorState:

@@ -60,7 +60,9 @@ def analysis_input(settings: AnalysisSettings) -> tuple[AnalysisInput, tuple[str
     control = kit.control
     speed = _speed(model, control, settings.speed)
     notes = [
-        f"scenario {scenario.name}" if scenario else "no scenario, so no response of a machine is estimated"
+        f"scenario {scenario.name}"
+        if scenario
+        else "without a scenario, no response of the machine is estimated"
     ]
     ocp: OCP | None = None
     filters: dict[tuple[str, str], ExtendedKalmanFilter] = {}

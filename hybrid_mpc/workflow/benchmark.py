@@ -101,7 +101,7 @@ class BenchmarkSettings:
 
 @dataclass(frozen=True)
 class _Note:
-    """What a benchmark was made of; another one in its folder is refused."""
+    """Inputs of a benchmark; its folder cannot continue with other inputs."""
 
     scenario: str
     data: str
@@ -285,7 +285,10 @@ def choice_of_benchmark(context: Context) -> BenchmarkChoice:
     )
     choice = replace(found.choice, recommended=hybrid)
     if hybrid != found.choice.recommended:
-        why = f"Over validation pieces and long runs {hybrid} has less error than {found.choice.recommended}."
+        why = (
+            f"Over validation data and long runs, the error of {hybrid} is smaller than that of "
+            f"{found.choice.recommended}."
+        )
         choice = replace(
             choice, reason=f"{choice.reason} {why}", hybrid=choice.hybrid if hybrid == "phy" else hybrid
         )
@@ -318,7 +321,7 @@ def benchmark(
     Args:
         settings: Machine, files and effort.
         out: The folder to make, or one that an interrupted benchmark left.
-        progress: What shows the progress. Default: nothing.
+        progress: Progress display. Default: none.
         cluster: Address of a dask scheduler or a ``distributed.Client``, whose workers train the networks. They must
             reach the files and ``out`` under the same paths. Default: processes of this machine.
 
@@ -331,7 +334,7 @@ def benchmark(
     check_scenario(replace(scenario, plant=None))  # a benchmark runs no closed loop
     data, tests, warnings = _read(settings, scenario)
     for warning in warnings:
-        if data is None or warning not in data.dataset.warnings:  # stage data tells those
+        if data is None or warning not in data.dataset.warnings:  # stage data reports the others
             progress.warn(warning)
     if data is None:
         context = _finished(settings, scenario, progress)

@@ -40,9 +40,9 @@ def write_page(out: Path, scenario: Scenario, found: ExplainResult, command: Seq
         Section(
             "Error by step",
             (
-                "Each bar is the error of free runs over held-out recordings, all samples together. The pale part is "
-                "the reduction by the step. The dashed line is the sensor noise.",
-                f"The ratio to the previous step is another statistic: the {explanation.averaged}.",
+                "Each bar is the free-run error on held-out recordings, over all samples. The pale part is the "
+                "reduction by the step. The dashed line is the sensor noise.",
+                f"The ratio to the previous step is a different statistic: the {explanation.averaged}.",
             ),
             ((steps, "Held-out error of the nominal prior, of the fitted prior, and after each step."),),
             (steps_table(explanation), *([tests_table(found)] if found.tests else [])),
@@ -110,7 +110,7 @@ def steps_table(explanation: Explanation) -> Table:
             ("prior, fitted", explanation.before, None, "", ""),
             *rows,
         ],
-        f"Steps of the search, evaluated on {explanation.evidence.text}. Errors: all samples together. Ratios: "
+        f"Steps of the search, evaluated on {explanation.evidence.text}. Errors are over all samples. Ratios: "
         f"{explanation.averaged}, with an interval for all fitted candidates of a step together."
         + (f" {ALONE}" if explanation.evidence.recordings == 1 else ""),
     )
@@ -125,7 +125,7 @@ def tests_table(found: ExplainResult) -> Table:
             (MODELS[name], one.error, *(one.rmse[label] for label in labels))
             for name, one in found.tests.items()
         ],
-        f"{found.tests_title.capitalize()}, which neither fit nor search use.",
+        f"{found.tests_title.capitalize()}, which are used neither in the fit nor in the search.",
     )
 
 
@@ -176,7 +176,7 @@ def trials_table(explanation: Explanation) -> Table:
 
 def _about_terms(explanation: Explanation) -> Sequence[str]:
     if not explanation.found:
-        return ("No term lowers the held-out error significantly: the prior stays as it is.",)
+        return ("No term reduces the held-out error significantly: the prior is unchanged.",)
     hidden = [term.name for term in explanation.found if state_of(term)]
     texts = [
         "The line is the fitted term. The points are the term plus the residual of the model with all terms, sample by "
@@ -194,12 +194,12 @@ def _judged(explanation: Explanation) -> Sequence[str]:
         "together.",
         f"The search chose from {explanation.candidates} candidates. Each step scores all candidates by one "
         "Gauss-Newton step. The best candidates are fitted in every fold, with all parameters and initial states.",
-        f"A term is added if its ratio to the previous step is below {ADDED:g} and the upper end of its interval is "
-        f"below 1. The ratio is the {explanation.averaged}. The true ratio lies beyond one end of the interval with a "
-        f"probability of {DOUBT:.0%}, for all fitted candidates of the step together. In the upper end, a reduction by "
-        f"more than {1 - GAIN:.0%} counts as {1 - GAIN:.0%}.",
-        "A term is not added if its parameters are not identifiable, if one ends at its bound, or if the error with "
-        f"the term stays above {POOR:g} and its ratio above {GAIN:g}.",
+        f"A term is added if its ratio to the previous step is below {ADDED:g} and the upper bound of its interval is "
+        f"below 1. The ratio is the {explanation.averaged}. The true ratio exceeds one bound of the interval with a "
+        f"probability of {DOUBT:.0%}, for all fitted candidates of the step together. For the upper bound, a "
+        f"reduction by more than {1 - GAIN:.0%} counts as {1 - GAIN:.0%}.",
+        "A term is not added if its parameters are not identifiable or end at a bound, or if the error with the term "
+        f"stays above {POOR:g} and the ratio above {GAIN:g}.",
         *([ALONE] if own.recordings == 1 else []),
         "Errors are root mean squares over all held-out samples, divided by the outputs' spreads.",
     )
@@ -241,7 +241,8 @@ def _hints(found: ExplainResult) -> Sequence[Hint]:
     if "explained" in tests and tests["explained"].error > tests["fitted"].error:
         hints.append(
             Hint("bad", "On the test recordings, the found terms increase the error.",
-                 "The test recordings cover conditions that the others lack: use some of them for training.")
+                 "The test recordings cover conditions that the training recordings lack: use some of the test "
+                 "recordings for training.")
         )  # fmt: skip
     alternatives = [(s.name, alternatives_of(s)) for s in explanation.steps if s.alternatives]
     hints += [

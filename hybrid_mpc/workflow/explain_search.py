@@ -49,7 +49,8 @@ def prior_class(scenario: Scenario) -> type[Prior]:
     except TypeError as error:
         raise InputError(
             f"scenario {scenario.name}: {made.__name__}() raised TypeError: {error}. The search needs a prior class "
-            "whose only argument is parameter values; make the other arguments class attributes [HM-WORKFLOW-020]"
+            "with parameter values as the only argument; turn the other arguments into class attributes "
+            "[HM-WORKFLOW-020]"
         ) from error
     return made
 

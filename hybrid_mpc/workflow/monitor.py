@@ -131,7 +131,7 @@ def prepared(
     watched = kit.models[kit.recommended]
     if abs(watched.dt - spec.dt) > 1e-9:
         raise InputError(
-            f"dt: the model's period is {watched.dt} s, but scenario {kit.name} resamples to {spec.dt} s. Give the "
+            f"dt: the model period is {watched.dt} s, but scenario {kit.name} resamples to {spec.dt} s. Give the "
             "scenario of this model [HM-WORKFLOW-024]"
         )
     # the monitor watches whole recordings: no warm-up, no roles

@@ -45,7 +45,7 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
         doubts += data.warnings
         if data.sampling[0] > COARSE * spec.dt:
             problems.append(
-                f"{path}: sampled every {data.sampling[0]:.3g} s, too slow for the model's period of {spec.dt:g} s. "
+                f"{path}: sampled every {data.sampling[0]:.3g} s, too slow for the model period of {spec.dt:g} s. "
                 "Record at least one sample a period [HM-WORKFLOW-029]"
             )
         late = lost_samples(kit.input_delay, spec.dt) * spec.dt

@@ -201,8 +201,8 @@ def _as_it_is(context: Context, stage: Stage[Any], only: Sequence[str] = ()) -> 
     """
     stored = context.stored(stage)
     if stored is None or stored.unfit:
-        context.leave_out(stage, f"stage {stage.name} was left out")
-        return "left out"
+        context.leave_out(stage, f"stage {stage.name} was skipped")
+        return "skipped"
     keys = stage.keys(context)
     if differ := differing(stored.keys, keys):
         needing = [s.name for s in STAGES if s.name in only and s is not REPORT and stage in _needed(s)]

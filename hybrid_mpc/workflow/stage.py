@@ -225,14 +225,14 @@ def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     unknown = [name for name, key in now.items() if not key]
     words = [found] if (found := differing(before, now)) else []
     if unknown:
-        words.append(f"a change of {', '.join(unknown)} cannot be detected, so it counts as changed")
+        words.append(f"{', '.join(unknown)} may have changed: a change cannot be detected")
     return "; ".join(words)
 
 
 def bring_up_to_date(context: Context, stage: Stage[Any], skip: bool = False) -> str:
     """Run a stage unless its stored result is up to date; returns a text for the terminal.
 
-    With ``skip`` a stage without an up-to-date result is left out.
+    With ``skip`` a stage without an up-to-date result is skipped.
 
     Raises:
         InputError: If a required stage cannot run.
@@ -242,14 +242,14 @@ def bring_up_to_date(context: Context, stage: Stage[Any], skip: bool = False) ->
     if stored is not None:
         why = stored.unfit or changed(stored.keys, keys)
         if not why and isinstance(stored.result, Absent):
-            why = "it could not run before" if stored.result.failed else ""
+            why = "it did not run before" if stored.result.failed else ""
         elif not why:
             why = stage.restore(context, stored.result)
         if not why:
             return "up to date"
     if skip:
-        context.leave_out(stage, f"stage {stage.name} was left out")
-        return "left out"
+        context.leave_out(stage, f"stage {stage.name} was skipped")
+        return "skipped"
     if why:
         context.progress.warn(f"stage {stage.name} runs again: {why}")
     result = _computed(context, stage)

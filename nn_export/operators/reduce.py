@@ -137,7 +137,7 @@ def norm(self: Value, ord: float = 2, dim: Sequence[int] | None = None, keepdim:
         return reduced(lambda x: _smallest(ca.fabs(x)), self, dim, keepdim)
     if ord > 1:
         return reduced(lambda x: _power(ca.sum2(ca.fabs(x) ** ord), 1 / ord), self, dim, keepdim)
-    raise ValueError(f"norm of order {ord}; known are -infinity, 1 and what is above 1 [NN-056]")
+    raise ValueError(f"norm of order {ord}; supported are -infinity, 1, and numbers above 1 [NN-056]")
 
 
 def std_dim(self: Value, dim: Sequence[int] | None, unbiased: bool = True, keepdim: bool = False) -> Value:

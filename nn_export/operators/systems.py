@@ -25,7 +25,7 @@ def each(f: Callable[..., Any], *values: Value) -> Value:
     lead = values[0].shape[:-2]
     if any(v.shape[:-2] != lead for v in values):
         raise ValueError(
-            f"matrices of shapes {[v.shape for v in values]}: as many of each are needed [NN-062]"
+            f"matrices of shapes {[v.shape for v in values]}: equal numbers of matrices are needed [NN-062]"
         )
     found = [f(*parts) for parts in zip(*map(stacks, values), strict=True)]
     joined = concatenate([from_matrix(m, (1, *m.shape)) for m in found], 0)

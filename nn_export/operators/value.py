@@ -68,7 +68,9 @@ def room(*shape: int) -> None:
         ValueError: If it has more than ``LARGEST`` numbers.
     """
     if (size := size_of(shape)) > LARGEST:
-        raise ValueError(f"it would make {size:.3g} numbers, at most {LARGEST} can be exported [NN-066]")
+        raise ValueError(
+            f"the operator would make {size:.3g} numbers, at most {LARGEST} can be exported [NN-066]"
+        )
 
 
 def unrolled(steps: int) -> None:
@@ -79,7 +81,7 @@ def unrolled(steps: int) -> None:
     """
     if steps > UNROLLED:
         raise ValueError(
-            f"it would go along an axis in {steps} steps, at most {UNROLLED} can be exported [NN-067]"
+            f"the operator would need {steps} steps, at most {UNROLLED} can be exported [NN-067]"
         )
 
 

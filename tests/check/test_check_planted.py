@@ -195,7 +195,7 @@ PLANTED = {
             )(),
             data=replace(KETTLE.data, disturbances=()), sensor_sigma=(1e-3, 0.1),
             control=OCP(10, (1, 1, 0), (1, 1), (1, 1), (0, 0), (0.2, 4e6)),
-        ), "no input moves room and nothing brings it back",  # the cause, which the code does not tell
+        ), "no input affects room, and the dynamics do not return",  # the cause, which the code does not tell
     ),
     "no disturbance that is unmeasured": (cart_with(disturbance_model=()), "HM-MODEL-005"),
 }  # fmt: skip

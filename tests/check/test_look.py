@@ -46,7 +46,7 @@ def test_a_look_says_columns_time_gaps_and_what_stands_out(file):
         ["time [s]", "u [V]", "level [mm]", "code", "k"],
     )
     time, u, level, code, k = found.columns
-    assert (time.note, u.unit, level.unit, level.count, k.note) == ("time", "V", "mm", 177, "does not move")
+    assert (time.note, u.unit, level.unit, level.count, k.note) == ("time", "V", "mm", 177, "constant")
     assert abs(float(u.high) - U.max()) < 0.01 * np.ptp(U)
     assert code.count == 200
     told = "\n".join(found.findings)

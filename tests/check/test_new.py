@@ -553,7 +553,7 @@ def test_the_good_one_of_two_times_is_taken(tmp_path):
     draft = write_scenario(tmp_path / "m.py", logged(tmp_path / "a.csv", stamps(), "elapsed [s]", days))
     assert draft.time.full == "elapsed [s]"
     assert set(draft.left_out) == {"Time [s]"}
-    assert draft.left_out["Time [s]"] == "by its name it is a time"
+    assert draft.left_out["Time [s]"] == "the time by its name"
 
 
 @pytest.mark.parametrize(

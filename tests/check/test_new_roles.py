@@ -315,9 +315,7 @@ def test_several_recordings(call, tmp_path):
     words = [word for file in files for word in ("--data", file)]
     code, told, error = call("new", tmp_path / "m.py", *words)
     assert code == 0, error
-    assert [line for line in told.splitlines() if "push" in line] == [
-        "not used: push (it is missing in a.csv)"
-    ]
+    assert [line for line in told.splitlines() if "push" in line] == ["not used: push (missing in a.csv)"]
     assert all(f"--data {file}" in told.splitlines()[-1] for file in files)
     scenario = load_scenario(str(tmp_path / "m.py"))
     assert (scenario.data.inputs, scenario.data.outputs) == (("valve",), ("level_m",))
@@ -332,7 +330,7 @@ def test_columns_that_move_in_one_recording_alone(tmp_path):
     moving = written(tmp_path / "b.csv", 1, more={"fan_pct": 30 + 10 * steps(900, 5)})
     draft = write_scenario(tmp_path / "m.py", [still, moving])
     assert [c.full for c in draft.inputs] == ["valve", "fan_pct"]
-    assert write_scenario(tmp_path / "n.py", still).left_out == {"fan_pct": "it is constant at 30"}
+    assert write_scenario(tmp_path / "n.py", still).left_out == {"fan_pct": "constant at 30"}
 
 
 def test_recordings_that_do_not_fit_together(tmp_path):

@@ -50,7 +50,7 @@ def test_one_look_is_student_s_interval():
 
 def test_what_is_decided():
     assert Comparison(0.5, 0.4, 0.6, 6).finding == "cheaper"
-    assert Comparison(2.0, 1.1, 3.0, 6).finding == "dearer"
+    assert Comparison(2.0, 1.1, 3.0, 6).finding == "more expensive"
     assert Comparison(1.0, 1 - SAME / 2, 1 + SAME / 2, 6).finding == "the same"
     assert Comparison(0.99, 0.985, 0.995, 6).finding == "the same"  # apart, but nobody cares
     assert Comparison(0.9, 0.7, 1.1, 6).finding == Comparison(0.5, None, None, 1).finding == "undecided"

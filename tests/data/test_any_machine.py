@@ -83,7 +83,7 @@ def test_a_slow_sensor_of_a_disturbance_is_bridged_and_what_it_does_not_cover_is
     told = finding.kind, finding.channel, finding.count, finding.start
     assert told == ("missing", "wind", 594, 0.0)
     assert "594 of 600 rows (99 %)" in str(finding)
-    assert "without a number is 1 s" in str(finding)
+    assert "the longest gap is 1 s" in str(finding)
 
 
 def test_trajectories_are_made_without_disturbances():

@@ -173,6 +173,6 @@ def test_too_few_lines_are_a_warning_by_name():
     u = sine(0.5) + sine(1.5)
     assert check_excitation([run(u)], inputs=INPUT, parameters=4) == ()
     (warning,) = check_excitation([run(u)], inputs=INPUT, parameters=5)
-    assert "torque has 2 lines (0.5, 1.5 Hz), 5 parameters of a linear model need 3" in warning
+    assert "torque excites 2 frequencies (0.5, 1.5 Hz); 5 parameters of a linear model need 3" in warning
     (warning,) = check_excitation([run(np.r_[np.zeros(3), 1.0])], inputs=INPUT, parameters=1)
-    assert "no line" in warning  # four samples tell no frequency
+    assert "no frequency" in warning  # four samples tell no frequency

@@ -56,7 +56,7 @@ def test_frozen_sensors(tmp_path, sensor):
     told = one.kind, one.file, one.channel, one.count, one.start, one.refused
     assert told == ("frozen", "run.csv", "phi", 150, 5.0, False)
     for words in (
-        "run.csv: column 'phi' repeats", "from 5 to 6.19 s, 120 samples (1 more such stretch, 150", "delete",
+        "run.csv: column 'phi' repeats", "from 5 to 6.19 s, 120 samples (1 more such interval, 150", "deleting",
     ):  # fmt: skip
         assert words in str(one)
 
@@ -65,7 +65,7 @@ def test_a_sensor_that_stops_at_rest_is_told_by_the_inputs(tmp_path):
     """It never moves again, so nothing is abrupt: the inputs go on as before."""
     resting = quantised(SWING * np.clip((10 - T) / 3, 0, 1) ** 2)  # comes to rest at 10 s
     (one,) = findings(tmp_path, resting)
-    assert (one.kind, "while the inputs move" in one.message) == ("frozen", True)
+    assert (one.kind, "while the inputs keep moving" in one.message) == ("frozen", True)
     assert one.start == pytest.approx(10.0, abs=0.3)
     assert findings(tmp_path, resting, tau=np.where(T > 9.5, 0.2 * TAU, TAU)) == ()  # too little to move it
     # a file that stands still from its begin to its end, among others that move
@@ -80,7 +80,7 @@ def test_clipped_sensors(tmp_path, sensor):
     (one,) = findings(tmp_path, phi)
     assert (one.kind, one.channel, one.count) == ("clipped", "phi", int((phi == 1.0).sum()))
     assert one.start == pytest.approx(T[np.argmax(phi == 1.0)])
-    for words in ("largest value, 1 rad", "clipped", "against a stop"):
+    for words in ("largest value, 1 rad", "clipped", "mechanical stop"):
         assert words in str(one)
     both = findings(tmp_path, np.clip(sensor(SWING), -0.8, 1.0))
     assert [one.message.split("its ")[1].split(" ")[0] for one in both] == ["largest", "smallest"]
@@ -101,11 +101,11 @@ def test_wrapped_angles_count_on_where_the_signal_is_periodic(tmp_path):
     spec = replace(SPEC, units={"phi": "deg"})
     (same,) = findings(tmp_path, np.rad2deg(turning) % 360, signals=TURNS, spec=spec)
     assert same.kind == "wrapped"
-    match = r"run.csv: column 'phi' jumps \d+ times .* Declare Signal.*periodic=True"
+    match = r"run.csv: column 'phi' jumps \d+ times .* declare Signal.*periodic=True"
     with pytest.raises(InputError, match=match):
         findings(tmp_path, wrapped)
     near = replace(PHI, periodic=True, lower=-8, upper=8)
-    match = r"8\.\d+ is outside .* of phi, with \d+ jumps of a full turn taken out"
+    match = r"8\.\d+ is outside .* of phi, with \d+ jumps of a full turn removed"
     with pytest.raises(InputError, match=match):
         findings(tmp_path, wrapped, signals={**TURNS, "outputs": (near,)})
 

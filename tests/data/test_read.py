@@ -106,12 +106,12 @@ def test_bad_columns(tmp_path, kind):
 @pytest.mark.parametrize(
     ("phi", "match"),
     [
-        (np.rad2deg(np.sin(3 * T)), r"In deg it would be plausible: write units=\{'phi': 'deg'\}"),
+        (np.rad2deg(np.sin(3 * T)), r"The values are plausible in deg: write units=\{'phi': 'deg'\}"),
         (
             np.where(np.arange(60) == 40, 1e307, np.rad2deg(np.sin(3 * T))),
             r"1e\+307 in row 42\)\. Check unit",
         ),
-        (12 * np.sin(3 * T), r"of phi \(\d+ such rows, the largest 1\d.* in row \d+\)\. Check unit"),
+        (12 * np.sin(3 * T), r"of phi \(\d+ rows in all; the largest is 1\d.* in row \d+\)\. Check unit"),
         (1e7 * np.sin(3 * T), r"in row \d+\)\. Check unit"),
     ],
 )
@@ -138,7 +138,7 @@ def test_bad_rows_of_csv(tmp_path):
     refused(with_rows({11: "0.1,1,abc,0"}), "row 12, column 'phi' is 'abc'")
     refused(with_rows({11: "0.1,,1,0"}), "row 12, column 'tau' is empty")
     refused(with_rows({0: "time_s,tau,phi,phi"}), "HM-DATA-083")
-    refused(with_rows({5: "1,2", 6: "1,2"}), r"4 \(2 such rows\).*HM-DATA-093")
+    refused(with_rows({5: "1,2", 6: "1,2"}), r"4 \(2 rows in all\).*HM-DATA-093")
     refused(with_rows({0: "time_s,ta,ph,note"}), "HM-DATA-085")
     several = {5: "0.04,broken,0.1,0", 11: "0.1,0.9,none,0", 12: "0.11,0.9,?,0", 20: "0.19,77,0.1,0"}
     refused(
@@ -293,8 +293,8 @@ def test_damaged_vectors_are_an_input_error_or_what_was_written(tmp_path, vector
 @pytest.mark.parametrize(
     ("cell", "match"),
     [
-        ("ON", "a word for a switch"), ("2 V", r"a unit.*'name \[V\]'"),
-        ("5m/s", "a unit"), ('"1,5"', "a decimal comma"), ('"1.200,5"', "a mark between thousands"),
+        ("ON", "a word such as on"), ("2 V", r"a unit.*'name \[V\]'"),
+        ("5m/s", "a unit"), ('"1,5"', "a decimal comma"), ('"1.200,5"', "a thousands separator"),
         ("2024-01-31 10:00:00", "a date or a time"),
         ("31.01.2024", "a date or a time"), ("31-Jan-2024 10:00:00", "a date or a time"),
         ("10:00:00.5", "a date or a time"), ("abc", "Correct the value"), ("0x1f", "Correct the value"),

@@ -258,10 +258,10 @@ AMBIGUOUS = {
     "no table": ("nothing here\nis a number\n", "HM-DATA-093"),
     "day or month": (
         text(with_cells(lambda k, c: f"0{1 + k % 2}/0{2 + k % 3}/2024 10:00:{k:02d}", 0)),
-        "day or month may",
+        "with the day or with the month",
     ),
     "hours or minutes": (text(with_cells(lambda k, c: f"10:{k:02d}", 0)), "hours and minutes"),
-    "no such day": (text(with_cells(lambda k, c: f"30.02.2024 10:00:{k:02d}", 0), ";"), "does not exist"),
+    "no such day": (text(with_cells(lambda k, c: f"30.02.2024 10:00:{k:02d}", 0), ";"), "do not exist"),
     "two zones by name": (
         text(with_cells(lambda k, c: f"2024-03-31 10:00:{k:02d} {'CET' if k < 9 else 'CEST'}", 0)),
         "time zones",
@@ -276,12 +276,14 @@ AMBIGUOUS = {
     "a word": (text(cell(7, 1, "overload")), "row 9, column 'u' is 'overload'"),
     "three positions": (text(with_cells(lambda k, c: ("on", "off", "auto")[k % 3])), "row 2, column 'u'"),
     "a row of words": (text([*PLAIN[:9], ["off", "line", "now"], *PLAIN[9:]]), "row 11, column 't'"),
-    "a switch among numbers": (text(cell(7, 1, "ON")), "row 9, .*switch"),
+    "a switch among numbers": (text(cell(7, 1, "ON")), "row 9, .*such as on or true"),
     "a short row": (text([*PLAIN[:9], PLAIN[9][:2], *PLAIN[10:]]), r"11.*HM-DATA-093"),
     "a long row": (text([*PLAIN[:9], [*PLAIN[9], "1"], *PLAIN[10:]]), r"11.*HM-DATA-093"),
     "a header of numbers": (text(PLAIN, header=("0", "1", "2")), r"row 1 .*HM-DATA-089"),
     "decimal commas between commas": (text(GERMAN), "HM-DATA-089"),
-    "a month a row": (text(with_cells(lambda k, c: f"0{1 + k % 9}/0{1 + k // 9}/2024", 0)), "day or month"),
+    "a month a row": (
+        text(with_cells(lambda k, c: f"0{1 + k % 9}/0{1 + k // 9}/2024", 0)), "with the day or with the month"
+    ),
     "a header too short": (text(PLAIN, header=("t", "u")), "HM-DATA-089"),
     "a header by other separators": (text(PLAIN, ";", header=("t,u,y,z",)), "HM-DATA-089"),
     "units that contradict": (

@@ -90,5 +90,5 @@ def test_a_training_that_was_interrupted_and_damaged(tmp_path):
         if damaged == content:
             continue
         path.write_bytes(damaged)
-        with pytest.raises(InputError, match=r"delete it to train anew|other settings"):
+        with pytest.raises(InputError, match=r"delete this file to train again|other settings"):
             load_checkpoint(path, "key")

@@ -145,7 +145,7 @@ def test_the_bound_is_that_of_the_mean_over_recordings_and_both_must_be_better()
     assert own.ratio < own.upper < 1.0
     assert own.error > choice.candidates["phy"].error  # over all together it is worse: the rule is no looser
     assert choice.recommended == "phy"
-    assert "over all of them together the prior's error is not larger" in choice.reason
+    assert "the prior's error over all these data together is not larger" in choice.reason
 
 
 def test_of_two_sure_hybrids_the_one_of_the_lower_ratio_is_taken():
@@ -171,7 +171,7 @@ def test_two_recordings_give_no_bound():
     assert two.candidates["pgrnn"].ratio == pytest.approx(0.5)
     assert two.candidates["pgrnn"].upper == np.inf
     assert two.recommended == "phy"
-    assert "no upper bound: record more; 2 recordings" in two.reason
+    assert "no upper bound: too few data; 2 recordings" in two.reason
     assert recommend(errors, recordings=["a", "b", "c"]).recommended == "pgrnn"
 
 

@@ -382,7 +382,11 @@ def test_a_single_recording_must_show_more(recordings, ratio, added):
 
 @pytest.mark.parametrize(
     ("ratio", "outcome", "words"),
-    [(0.97, "unsure", "not surely better"), (0.8, "unsure", "not surely better"), (1.1, "worse", "worse")],
+    [
+        (0.97, "unsure", "not significantly better"),
+        (0.8, "unsure", "not significantly better"),
+        (1.1, "worse", "worse"),
+    ],
 )
 def test_the_outcome_does_not_contradict_the_ratio(ratio, outcome, words):
     error = HeldOutError(error=0.1, ratio=ratio, lower=0.7, upper=1.2, harm=0.5)

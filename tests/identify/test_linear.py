@@ -407,7 +407,7 @@ def test_a_disturbance_that_rests_is_doubtful():
     for fit in (fit_arx, fit_subspace):
         model = fit(*still, 0.1, warm=10)
         assert model.warnings == (
-            "measured disturbance (input 3) never changes in the training recordings: the model does not know it",
+            "measured disturbance (input 3) never changes in the training recordings, so the model lacks its effect",
         )
         assert off(response(model.state_space())[:, :2], response(control.ss(*system(), 0.1))) < EXACT
         assert np.abs(model.state_space().B[:, 2]).max() < EXACT

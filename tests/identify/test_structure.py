@@ -253,5 +253,5 @@ def test_slopes_by_a_held_factor_are_left_out(noisy):
     [(-1.0, True), (57.0, True), (1e-3, True), (0.5, False), (2.0, False), (-7.0, False), (np.nan, True)],
 )
 def test_factors_that_missing_physics_may_have_are_not_exact(factor, exact):
-    why = "they seem to be exchanged" if np.isnan(factor) else reading_of(factor)
+    why = "the two seem to be exchanged" if np.isnan(factor) else reading_of(factor)
     assert Cause("a", why, 0.5, factor).exact == exact

@@ -125,7 +125,7 @@ def test_results_of_other_shapes_than_declared_are_refused():
     ],
 )
 def test_arguments_of_other_types_are_refused(op, args, kwargs, words):
-    with pytest.raises(ProgramError, match=rf"node n .*arguments that nn_export does not know: .*{words}"):
+    with pytest.raises(ProgramError, match=rf"node n .*arguments that nn_export does not support: .*{words}"):
         build(one_node(op, [X, *args], (2,), kwargs))
 
 

@@ -24,7 +24,7 @@ def test_every_trial_is_a_point_and_the_best_never_rises():
     assert points(ax, "pruned") == [[3, 0.6]]
     assert points(ax, "diverged") == [[1, ax.get_ylim()[1]]]
     assert points(ax, "best so far") == [[0, 0.3], [2, 0.3], [4, 0.1]]
-    assert {y for _, y in points(ax, "settings it started from")} == {0.3}
+    assert {y for _, y in points(ax, "initial settings")} == {0.3}
 
 
 def test_a_panel_a_setting():

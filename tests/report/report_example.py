@@ -237,7 +237,7 @@ def report(folder: Path) -> Report:
         "Parameters of the prior.",
     )
     results = Table(
-        ("model", "RMSE of phi [rad]", "E_sim [spreads]", "violation of energy [W]"),
+        ("model", "RMSE of phi [rad]", "E_sim [-]", "violation of energy [W]"),
         tuple((name_of(m), *ERRORS[m].values()) for m in MODELS),
         "Errors on test data.",
     )

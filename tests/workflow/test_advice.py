@@ -69,7 +69,9 @@ def warned(results: Results, warning: str) -> Results:
 
 def test_how_a_file_was_read_asks_for_nothing(results):
     """A note on the recordings is no hint."""
-    noted = replace(results, data=replace(results.data, notes=("a.csv: as it was read: a decimal comma",)))
+    noted = replace(
+        results, data=replace(results.data, notes=("a.csv: conversions while reading: a decimal comma",))
+    )
     assert advice(noted) == advice(results)
 
 
@@ -111,7 +113,9 @@ def test_each_finding_is_told_with_what_to_do(results):
     assert bad(poor) == ["The fitted prior has a FIT of 41 % on phi: the prior is too coarse."]
     bands = results.evaluation.bands
     thin = evaluation(results, bands={**bands, own: replace(bands[own], coverage=0.6)})
-    assert bad(thin) == [f"The 90% band of {own.upper()} contains 60% of the test data: it is too narrow."]
+    assert bad(thin) == [
+        f"The 90% band of {own.upper()} contains 60% of the test data: the band is too narrow."
+    ]
     linear = prior(results, baselines=better(results, 0.02))
     assert bad(linear) == [
         f"On test data the linear model ARX has an error of 0.02, {own.upper()} {scores[own].model.error:.3g}."

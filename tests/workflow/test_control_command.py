@@ -108,7 +108,7 @@ def test_ctrl_c_loses_no_finished_loop(call, run_folder, tmp_path, monkeypatch):
     code, _, error = call(*words)
     assert (code, "--resume" in error) == (130, True)
     code, _, error = call(*words)
-    assert (code, "already holds a control" in error) == (2, True)
+    assert (code, "already contains a control" in error) == (2, True)
     code, _, error = call(*words[:-2], 3, "--no-gif", "--resume")
     assert (code, "seeds differ" in error) == (2, True)
     assert call(*words, "--resume")[0] == 0
@@ -168,7 +168,7 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, short, run_folder, tmp_
         (["--task", "golf"], ["HM-COMPARE-058", "track_sine", "stroke_1.4"]),
         (["--controller", "pid"], ["no controller 'pid'", "hybrid_observer"]),
         (["--solver", "newton"], ["no solver 'newton'", "rti, native, sqp, ipopt"]),
-        (["--controller", "oracle", "--solver", "sqp"], ["oracle", "solver of its own"]),
+        (["--controller", "oracle", "--solver", "sqp"], ["oracle", "its own solver"]),
         (["--fault", "fire=1"], ["'fire'", "measurement_offset"]),
         (["--fault", "plant_fire=1@1"], ["plant_fire", "plant_friction"]),
         (["--fault", "input_gain=lots"], ["input_gain=lots", "TARGET:CHANNEL=VALUE@START:END"]),

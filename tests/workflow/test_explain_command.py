@@ -76,7 +76,7 @@ def test_ratios_are_one_statistic_with_one_name(explained, machine):
     assert words in (out / found.file).read_text()
     figure = error_steps(*explain_page.bars_of(told), "error [-]")
     assert not any("%" in text.get_text() for text in figure.axes[0].texts)
-    rule = f"below {ADDED:g} and the upper end of its interval is below 1"
+    rule = f"below {ADDED:g} and the upper bound of its interval is below 1"
     assert rule in page
     assert rule in (Path(__file__).parents[2] / "docs/explain.md").read_text()
 

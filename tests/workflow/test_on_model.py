@@ -90,7 +90,7 @@ def test_check_names_the_default_tasks(call, bare_tanks):
     code, told, _ = call("check", bare_tanks / "tanks.py")
     assert code == 0
     assert "none given; default tasks: A step of lower by 0.1 m" in told
-    assert "there is no plant" in told
+    assert "without a plant" in told
 
 
 def test_without_another_network_the_hybrid_s_controller_has_no_machine(bare_tanks, kit):

@@ -124,8 +124,8 @@ def test_all_that_is_wrong_with_recordings_is_told_at_once(call, bare_tanks, mod
     code, _, error = call("predict", model, *files, "--out", tmp_path / "o")
     assert code == 2
     for words in (
-        "named.csv", "'pump'", "coarse.csv: sampled every 10 s, too slow for the model's period of 5 s",
-        "short.csv: 21 samples over 100 s are fewer than the 150 s that the warm-up (100 s)",
+        "named.csv", "'pump'", "coarse.csv: sampled every 10 s, too slow for the model period of 5 s",
+        "short.csv: the recording is 100 s long (21 samples), but the warm-up (100 s)",
         "torn.csv: too short. Its longest part without a gap has 100 s; the warm-up of 100 s and 10 periods need 150 s",
     ):  # fmt: skip
         assert words in error

@@ -137,7 +137,7 @@ def test_only_and_skip(own, call):
     code, _, message = call(*command, "--skip", "watch")
     assert code == 0, message
     assert not (out / "checkpoints" / "watch.json").exists()
-    assert read_results(out / "results.json").watch == Absent("stage watch was left out")
+    assert read_results(out / "results.json").watch == Absent("stage watch was skipped")
     code, _, message = call(*command, "--only", "watch")
     assert code == 0, message
     after = stamps(out)
@@ -327,7 +327,7 @@ def test_only_does_not_take_a_result_of_another_version(context, monkeypatch):
     monkeypatch.setattr(job, "STAGES", (one(never), replace(one(never), name="later")))
     with pytest.raises(InputError, match=r"sum.*later.*HM-WORKFLOW-032"):
         _end(fresh, ("later",))
-    assert _as_it_is(fresh, one(None, optional=True)) == "left out"
+    assert _as_it_is(fresh, one(None, optional=True)) == "skipped"
 
 
 def test_a_stage_reads_others_by_what_they_found(context):
@@ -427,7 +427,7 @@ def test_loops_read_tasks_by_what_they_say(tmp_path):
 
 def test_changes_are_named():
     assert changed({"a": "1", "b": "2"}, {"a": "3", "c": "4"}) == "changed: a, c, b"
-    assert changed({}, {"plant": ""}) == "a change of plant cannot be detected, so it counts as changed"
+    assert changed({}, {"plant": ""}) == "plant may have changed: a change cannot be detected"
 
 
 def test_the_observer_s_stage_names_what_it_reads():

@@ -89,7 +89,7 @@ def test_a_search_goes_on_with_more_trials(searched, words, tmp_path, call):
 def test_what_is_refused(searched, words, arguments, tmp_path, call):
     new = ["--out", tmp_path / "new"]
     for given, message in (
-        ([*words, "--out", searched], "already holds a run"),
+        ([*words, "--out", searched], "already contains a run"),
         ([*words, "--out", searched, "--resume", "--kind", "rnn"], "kind differ"),
         ([*words, "--out", searched, "--resume", "--seed", "1"], "seed differ"),
         ([*words[:-1], "decay=1:2", "--out", searched, "--resume"], "space differ"),

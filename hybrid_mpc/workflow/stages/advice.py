@@ -57,7 +57,7 @@ def _recordings(results: Results) -> Iterator[Hint]:
         yield Hint(
             "bad",
             f"Recordings: {warning}",
-            "Look at section Data. Record again, or set the DataSpec accordingly.",
+            "See section Data. Record again, or correct the DataSpec.",
         )
 
 
@@ -89,7 +89,7 @@ def _doubt(results: Results) -> Iterator[Hint]:
 def _prior(results: Results, explained: bool) -> Iterator[Hint]:
     fitted = results.prior.fit
     for warning in fitted.warnings[:MOST]:
-        yield Hint("plain", f"Fit of the prior: {warning}", "Look the warning up in docs/fit-trouble.md.")
+        yield Hint("plain", f"Fit of the prior: {warning}", "docs/fit-trouble.md explains this warning.")
     windows = min((row["validation_error"] for row in fitted.stages), default=math.inf)
     for label, fit in results.evaluation.scores["phy"].model.fit_percent.items():
         if fit >= EXPLAINED or not math.isfinite(fit):
@@ -135,8 +135,8 @@ def _choice(results: Results, explained: bool) -> Iterator[Hint]:
     else:
         yield Hint(
             "plain", why,
-            "The prior's error is noise, or it differs between recordings. Look at the residuals of the free runs for "
-            "a missing term of the prior or a nonlinear sensor.",
+            "The prior's error is noise, or the error differs between recordings. Look at the residuals of the free "
+            "runs for a missing term of the prior or a nonlinear sensor.",
         )  # fmt: skip
 
 
@@ -170,7 +170,7 @@ def _floor(results: Results, declared: Sequence[float]) -> Iterator[Hint]:
         if error < FLOOR * min(noise, own):
             yield Hint(
                 "good", f"{said}noise as estimated by the fit.",
-                "These recordings allow no better model. Use a better sensor, or excite the machine more.",
+                "With these recordings, no better model is possible. Use a better sensor, or excite the machine more.",
             )  # fmt: skip
         else:
             yield Hint(
@@ -188,13 +188,15 @@ def _bands(results: Results) -> Iterator[Hint]:
         return
     if band.coverage < band.share - HELD[0]:
         yield Hint(
-            "bad", f"The {band.share:.0%} band of {name_of(name)} contains {band.coverage:.0%} of the test data: "
-            "it is too narrow.",
+            "bad", (
+                f"The {band.share:.0%} band of {name_of(name)} contains {band.coverage:.0%} of the test data: the band "
+                "is too narrow."
+            ),
             "Test recordings differ from those that calibrated the band. Add such recordings to the training.",
         )  # fmt: skip
     elif band.coverage > band.share + HELD[1]:
         yield Hint(
-            "plain", f"The {band.share:.0%} band contains {band.coverage:.0%} of the test data: it is wide.",
+            "plain", f"The {band.share:.0%} band contains {band.coverage:.0%} of the test data: the band is wide.",
             "Validation recordings were harder to predict than the test recordings.",
         )  # fmt: skip
 
@@ -217,15 +219,15 @@ def _loops(results: Results) -> Iterator[Hint]:
         yield Hint(
             "bad", f"Controller step time: the 99th percentile is {time_text(ms.p99)} of wall time, but the "
             f"period is {time_text(ms.period)}.",
-            "Measure again on an idle computer. Else use the solver native (compiled C), a shorter horizon or a "
-            "longer dt.",
+            "Measure again on an idle computer. If the step is still too slow, use the solver native (compiled C), a "
+            "shorter horizon or a longer dt.",
         )  # fmt: skip
     control = closed_loops(results.control)
     for task, own in control.comparisons.items() if control is not None else ():
         found = own[base := hardest(own)]
         means = {name: control.means[task][name].cost.mean for name in (REPORTED["hybrid"], *own)}  # type: ignore[union-attr]
         lost = means.pop(REPORTED["hybrid"]) is None and any(cost is not None for cost in means.values())
-        if found.finding == "dearer" or lost:
+        if found.finding == "more expensive" or lost:
             worse = "diverges" if lost else f"has {found.words} times the cost of {base}"
             yield Hint(
                 "bad", f"In {task} hybrid_observer {worse}.",
@@ -234,8 +236,8 @@ def _loops(results: Results) -> Iterator[Hint]:
             )  # fmt: skip
     if not isinstance(results.on_model, Absent):
         yield Hint(
-            "plain", "The scenario has no plant: its loops ran on a model and say nothing about the machine.",
-            "Write a plant that differs from the prior as your machine may (Scenario(plant=...)).",
+            "plain", "The scenario has no plant: its closed loops ran on a model and show nothing about the machine.",
+            "Write a plant that differs from the prior as the machine may differ (Scenario(plant=...)).",
         )  # fmt: skip
 
 

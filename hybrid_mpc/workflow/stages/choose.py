@@ -22,7 +22,7 @@ from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, models_of
 
 Array = NDArray[np.float64]
 CANDIDATES = ("phy", "pgrnn", "mopgrnn")
-"""What may be recommended: the fitted prior, and the hybrids that :func:`models_of` the prior has."""
+"""Candidates for the recommendation: the fitted prior, and the hybrids that :func:`models_of` the prior has."""
 
 
 @dataclass(frozen=True)

@@ -190,8 +190,8 @@ def _unexplained(context: Context, deployed: str) -> Any:
         return
     figure = fit.input_correlations(context.spec.dt * np.arange(lags + 1.0), correlations)
     caption = (
-        "Correlation of the errors with earlier inputs. Beyond the dotted lines (95 % interval of independent errors), "
-        "the model lacks an effect of this input, or has a wrong gain or delay."
+        "Correlation of the errors with earlier inputs. Outside the dotted lines (95 % interval of independent "
+        "errors), the model lacks an effect of this input, or has a wrong gain or delay."
     )
     yield "free_run", "unexplained", figure, caption
 

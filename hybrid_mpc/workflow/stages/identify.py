@@ -202,8 +202,8 @@ def check_source(context: Context) -> None:
     """Refuse a scenario that cannot simulate recordings if the user gives none."""
     if not context.settings.data and context.scenario.make_data is None:
         raise InputError(
-            f"scenario {context.scenario.name}: no recordings. It cannot simulate them; give recordings of the machine "
-            f"with --data FILE.csv, once for each file [HM-WORKFLOW-037]"
+            f"scenario {context.scenario.name}: no recordings, and the scenario cannot simulate them. Give recordings "
+            "of the machine with --data FILE.csv, once for each file [HM-WORKFLOW-037]"
         )
 
 

@@ -83,7 +83,8 @@ def structure(prior: PriorResult, choice: Choice, explained: Explanation | None 
 
     Args:
         prior: The fitted prior, with the doubts about its present terms and signals.
-        choice: The networks beside it: a clearly lower held-out error is a sign of a missing term.
+        choice: Choice among prior and networks: a clearly lower held-out error of a network is a sign of a missing
+            term.
         explained: Result of the search for missing terms. Default: none was made.
     """
     errors = {

@@ -62,7 +62,7 @@ TITLES: Mapping[str, str] = {
 }
 CHANNEL_CAPTION = (
     "Channels of the monitor. A false alarm begins while no fault or disturbance acts; their interval is that of a "
-    "Poisson count. Each simulated fault stands beside the channel that alarms first."
+    "Poisson count. Each simulated fault is listed at the channel that alarms first."
 )
 FADED = "Training penalized the network's correction far away from all recordings"
 
@@ -275,7 +275,8 @@ def oracle_words(control: ControlResult) -> tuple[str, ...]:
         return ()
     return (
         f"In {', '.join(beaten)} the oracle does not have the least cost. The oracle knows the machine's equations, "
-        "but it estimates state and load from the same measurements as the others. So its cost is no lower bound.",
+        "but it estimates state and load from the same measurements as the others. So the oracle's cost is no lower "
+        "bound.",
     )
 
 
@@ -379,7 +380,7 @@ def _free_run_tables(context: Context) -> list[Table]:
     for name, one in errors.items():
         rmse, fit = ([_by(by, label) for label in outputs] for by in (one.rmse, one.fit_percent))
         rows.append((name, finite(one.error), _percent(one.error, base), *rmse, *fit))
-    columns = ("model", "error [spreads]", "over the prior's", *(f"RMSE of {label}" for label in outputs),
+    columns = ("model", "error [-]", "ratio to prior", *(f"RMSE of {label}" for label in outputs),
                *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
     length = context.prior.longest_run
     of = "" if length is None else f" of {length:.3g} s"
@@ -392,8 +393,8 @@ def _free_run_tables(context: Context) -> list[Table]:
     ]
     columns = (
         "model",
-        "E_sim [spreads]",
-        "over the prior's",
+        "E_sim [-]",
+        "ratio to prior",
         *(f"violation of {label}" for label in balances),
     )
     caption = "Free runs on test data: rates of the states" + (" and balances." if balances else ".")
@@ -409,10 +410,10 @@ def _choice_table(found: ChoiceResult) -> Table:
          "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]  # fmt: skip
-    columns = ("model", "correction", "error [spreads]", "over the prior's", "95 % upper bound", "")
+    columns = ("model", "correction", "error [-]", "ratio to prior", "95 % upper bound", "")
     caption = (
-        f"Choice of the model on held-out parts of the training data. {choice.reason} The error is that of all parts "
-        "together. The ratio is the geometric mean of the ratios by part, and the upper bound belongs to this mean. "
+        f"Choice of the model on held-out parts of the training data. {choice.reason} The error is over all parts "
+        "together. The ratio is the geometric mean of the ratios of the parts; the upper bound refers to this mean. "
         "Correction: share of the networks' correction that the model uses; below 100 % if the full correction is not "
         "significantly better."
     )
@@ -594,15 +595,15 @@ def _varying_table(found: TrackResult) -> Table:
     return Table(
         ("parameter", "fitted", "deviation, all together", "evidence, alone", "tracked with a deviation of"), rows,
         f"Standard deviations of the parameters between {found.varying.pieces} {of}. If all parameters may vary, some "
-        "replace others: these are fixed. Evidence is the gain of log evidence where one parameter alone varies; a "
-        "tracked one has the deviation that it has alone, or among all."
+        "parameters replace others and are fixed. Evidence: gain of the log evidence if one parameter alone varies. "
+        "The deviation of a tracked parameter is that of the parameter alone, or of all together."
         + (gain if tracked else " Tracking improves no prediction."),
     )  # fmt: skip
 
 
 def _timing_table(ms: StepTimes) -> Table:
     row = (ms.median, ms.p95, ms.p99, ms.max, ms.period, ms.misses)
-    caption = "Wall time of whole steps. The promise of the step time is about processor time."
+    caption = "Wall time of whole steps. The promise on the step time refers to processor time."
     return Table(
         ("median [ms]", "p95 [ms]", "p99 [ms]", "max [ms]", "period [ms]", "misses"), (row,), caption
     )

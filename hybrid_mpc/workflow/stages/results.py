@@ -37,7 +37,7 @@ SHOWN: tuple[Stage[Any], ...] = (
 
 @dataclass(frozen=True)
 class Results:
-    """What a run was, and what each of its stages found; a stage without a result has a reason instead.
+    """Settings of a run and the results of its stages; a stage without a result has a reason instead.
 
     Args:
         schema_version: Version of ``results.json``.
