@@ -21,17 +21,19 @@ from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
-from hybrid_mpc.estimate.offset_free import OffsetFree, distinguishable, offset_free
+from hybrid_mpc.estimate.offset_free import OffsetFree, distinguishable, offset_free, steady_matrices
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import periods_to_find
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import SEARCHED, make_ocp
+from hybrid_mpc.kit.disturbances import loads_by_parameters, rates_of_outputs
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.plant import ModelPlant, ModelState
 from hybrid_mpc.loop.simulate import ClosedLoopResult, simulate
 from hybrid_mpc.machine.signals import Signal
+from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.model.equilibrium import equilibrium_input, hidden_fixed_point
-from hybrid_mpc.model.model import HybridModel, output_with_jacobian
+from hybrid_mpc.model.model import HybridModel, kinematics, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
 from hybrid_mpc.rules import counted, time_text
 from hybrid_mpc.scenario import Task
@@ -63,6 +65,12 @@ STANDS = 0.2
 """Standard deviation of a true output, over that of its sensor noise, below which the output stands still."""
 CONSTANTS = 3
 """Time constants of the observer after which a load counts as estimated: exp(-3) = 5 % is left."""
+GAINS = 1.5
+"""Ratio of squared errors from which on disturbances at rates are recommended for loads elsewhere."""
+LIMITED = ("is at its limit", "within the limits")
+"""Ends of the reasons of an offset that a limit of the inputs causes."""
+ROUNDING = 1e-6
+"""Part of a unit load at the rate of a state that the disturbances do not represent, from which on it counts."""
 AT_LIMIT = 1e-3
 """Distance from a limit, over the input's range, that counts as at the limit."""
 LEAVES = 2.0
@@ -255,6 +263,11 @@ class Trial:
     def worst(self) -> Deviation:
         """The largest deviation."""
         return max(self.deviations, key=lambda one: one.size)
+
+    @property
+    def limited(self) -> bool:
+        """Whether a limit of the inputs causes the deviations."""
+        return self.why.endswith(LIMITED)
 
 
 @dataclass(frozen=True)
@@ -979,6 +992,89 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
     return Promise(name, "doubted", worst[1], remedy)
 
 
+def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
+    """Row "loads elsewhere": loops on the model itself, with a constant load at the rate of a state.
+
+    States count whose load the disturbances do not represent within a period. A load has the effect of an error of 20 %
+    in one parameter. The loops are compared with those of disturbances at the rates of the measured states, if the
+    outputs measure states of their own. None if no state counts, and without weights of outputs.
+
+    Args:
+        kit: The kit.
+        point: The set-point.
+    """
+    places = _find_unrepresented(point)
+    if not point.problem.n_y or not places:
+        return None
+    name, states, n = "loads elsewhere", point.model.states, LASTS * point.problem.horizon
+    trials = {i: _load_rate(point, i, load) for i, load in places.items()}
+    off = {i: one for i, one in trials.items() if one.why and not one.limited}
+    rates = rates_of_outputs(point.model, point.problem)
+    gains = [1.0]
+    if rates is not None:
+        other = _with_disturbances(kit, point, rates)
+        errors = [
+            (_mean_square(point, trials[i]), _mean_square(other, _load_rate(other, i, places[i])))
+            for i in places
+        ]
+        gains = [ours / theirs for ours, theirs in errors if theirs > 0]
+    gain, names = float(np.exp(np.mean(np.log(gains)))), ", ".join(states[i].name for i in places)
+    what = f"constant loads at the rates of {names}, each the effect of a parameter {100 * OFF:.0f} % off"
+    where = f"in loops of {n * point.model.dt:.3g} s on the model itself, {point.title}"
+    if not off and gain < GAINS:
+        return Promise(name, "shown", f"{what}, leave no offset {where}")
+    if rates is not None and gain >= GAINS:
+        declared = ", ".join(f'Disturbance("rate", "{d.signal}", {d.size:.2g})' for d in rates)
+        evidence = (
+            f"{what}: with a disturbance at each rate, the squared error is {1 / gain:.2g} times as large"
+        )
+        remedy = f"If such loads act, declare disturbance_model=({declared})."
+    else:
+        i, worst = max(off.items(), key=lambda one: one[1].worst.size)
+        evidence = (
+            f"a constant load of {places[i]:.2g} {states[i].unit}/s at the rate of {states[i].name} leaves "
+        )
+        evidence += str(worst.worst)
+        remedy = "If such loads act, declare a disturbance there (docs/disturbances.md)."
+    return Promise(name, "doubted", f"{evidence}, {where}", remedy)
+
+
+def _with_disturbances(kit: Kit, point: SetPoint, chosen: tuple[Disturbance, ...]) -> SetPoint:
+    """The same set-point with another disturbance model."""
+    of = kit.with_disturbances(chosen)
+    task = next((name for name in point.tasks[:1] if name in kit.loop.control), "")
+    model, controller = of.models[of.recommended], of.controller(task=task)
+    return replace(point, model=model, controller=controller, estimator=of.observer(task=task))
+
+
+def _find_unrepresented(point: SetPoint) -> dict[int, float]:
+    """Loads at the rates of states [unit/s] that the disturbances do not represent within a period, by state."""
+    model, (x, u) = point.model, point.rest
+    sizes, positions = loads_by_parameters(model, point.problem), kinematics(model)
+    h = hidden_fixed_point(model, x, u, w=point.w)
+    b_d = steady_matrices(model, x, h, u, point.w)[0][: model.n_x, model.n_x + model.n_h :]
+    left = np.linalg.norm(np.eye(model.n_x) - b_d @ np.linalg.pinv(b_d), axis=0)
+    return {
+        i: float(sizes[i])
+        for i in np.flatnonzero((left > ROUNDING) & (sizes > 0)).tolist()
+        if i not in positions
+    }
+
+
+def _load_rate(point: SetPoint, i: int, load: float) -> Trial:
+    """A loop on the model itself with a constant load [unit/s] at the rate of a state."""
+    model = replace(point.model, disturbance_model=(Disturbance("rate", point.model.states[i].name, load),))
+    plant = LoadedPlant(model, tuple(point.sigma), (load,))
+    return tried(point, plant, point.rest[0], LASTS * point.problem.horizon)
+
+
+def _mean_square(point: SetPoint, one: Trial) -> float:
+    """Mean squared error of the controlled outputs, over their noise."""
+    before = np.vstack([one.result.u[:1], one.result.u[:-1]])
+    errors = point.errors(one.result.y, before)[:, point.held] / point.sigma[point.held]
+    return float(np.nanmean(errors**2))
+
+
 def _name_disturbance(model: HybridModel, j: int) -> str:
     chosen = model.disturbance_model
     if chosen is None:
@@ -1061,8 +1157,10 @@ def examine(
     of_observer = process_noise(kit), innovations(tested)
     if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer)
+    elsewhere = loads_elsewhere(kit, points[0])
     return (
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
+        *([] if elsewhere is None else [elsewhere]),
         tasks_end(ends, where),
         time,
         *of_model,

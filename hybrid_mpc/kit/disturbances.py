@@ -90,6 +90,21 @@ def rates_of_outputs(model: HybridModel, control: OCP) -> tuple[Disturbance, ...
     return found.disturbance_model if found is not None and offset_free(found).detectable else None
 
 
+def loads_by_parameters(model: HybridModel, control: OCP) -> Array:
+    """Load at the rate of each state ``(n_x,)`` [unit/s] at the operating point: the largest effect that an error of
+    :data:`OFF` in one parameter has there; zero without free parameters.
+    """
+    found = _off_rates(model, control)
+    if not found:
+        return np.zeros(model.n_x)
+    return np.asarray(np.max(np.abs(found[0]), axis=1) / model.dt)
+
+
+def _off_rates(model: HybridModel, control: OCP) -> list[Array]:
+    """What errors of the parameters add to the states in a period ``(n_x, n_free)``, by point of :func:`_rests`."""
+    return [off[: model.n_x] for _, off in _errors(model, control)]
+
+
 def _plain(model: HybridModel) -> tuple[Disturbance, ...] | None:
     """The disturbance model of a model; None if it is one at each input."""
     each = tuple(Disturbance("input", s.name) for s in model.inputs)
@@ -108,7 +123,7 @@ def _with_rates(model: HybridModel, control: OCP, held: Sequence[int], sizes: Si
     rows = output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full()
     # a disturbance of a rate moves the state by the state's size within half a horizon, or as errors of parameters do
     speeds, found = kinematics(model), [sizes.states / (0.5 * control.horizon * model.dt)]
-    found += [np.sqrt(np.sum(off[: model.n_x] ** 2, axis=1)) / model.dt for _, off in _errors(model, control)]
+    found += [np.sqrt(np.sum(off**2, axis=1)) / model.dt for off in _off_rates(model, control)]
     rates = np.max(found, axis=0)
     chosen: list[Disturbance] = []
     for i, signal in enumerate(model.outputs):

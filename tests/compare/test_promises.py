@@ -119,7 +119,7 @@ def test_a_set_point_at_the_limit_of_the_input_is_no_longer_promised():
     found = no_offset_of(kit_of(tank()), hold(0.95), draws=8)
     assert found.verdict == "doubted"
     assert "valve is at its limit" in found.evidence
-    assert re.search(r"level 0\.\d+ m off \(noise 0\.01 m\)", found.evidence)
+    assert re.search(r"level offset 0\.\d+ m \(noise 0\.01 m\)", found.evidence)
 
 
 def test_a_weight_on_the_input_asks_for_an_offset():
@@ -152,7 +152,7 @@ def test_a_disturbance_model_without_steps_does_not_move():
     row = p.disturbance_model([broken], trials[:1])
     assert (row.verdict, "gain on it is zero" in row.evidence) == ("not promised", True)
     row = p.no_offset(broken, trials)
-    assert (row.verdict, "does not move" in row.evidence) == ("doubted", True)
+    assert (row.verdict, "does not change" in row.evidence) == ("doubted", True)
 
 
 def test_ranks_that_lack_and_economic_costs_promise_nothing():
@@ -204,6 +204,50 @@ def test_a_loop_that_fails_is_one_row_with_the_cause():
     assert failing(1.3, 0.1, 1.0, 0.0)[1] is None
 
 
+def two_tanks(**options):
+    """An upper tank with a valve, and a lower one that it feeds; both are measured, and at work at 1 m."""
+    x, u, k = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("k")
+    nxt = ca.vertcat(0.9 * x[0] + 0.1 * u, 0.95 * x[1] + 0.05 * k * x[0])
+    levels = tuple(replace(LEVEL, name=name) for name in ("upper", "lower"))
+    valve = replace(VALVE, lower=0.0, upper=3.0)
+    model = HybridModel.of(
+        "tanks", 0.1, levels, (valve,), levels, x=x, u=u, p=k, x_next=nxt, xdot=(nxt - x) / 0.1, y=x,
+        parameters=(Parameter("k", 1.0, "-", 0.5, 2.0),), nominal_x=(1.0, 1.0), nominal_u=(1.0,), **options,
+    )  # fmt: skip
+    return replace(model, state_spread=(1.0, 1.0))
+
+
+TANKS = OCP(30, [0.0, 0.0], [0.0], [0.1], [0.0], [3.0], q_y=[0.0, 10.0])
+
+
+def test_loads_at_other_states_are_doubted_if_rates_reject_them_better():
+    """The load at the valve cannot represent one at the lower tank: 20 % of k is 0.1 m/s there."""
+    chosen = (Disturbance("input", "valve"),)
+    kit = kit_of(two_tanks(disturbance_model=chosen), TANKS)
+    (point,) = p.set_points(kit, [])
+    assert p._find_unrepresented(point) == {1: pytest.approx(0.2 * 0.05 / 0.1)}
+    row = p.loads_elsewhere(kit, point)
+    assert (row.name, row.verdict) == ("loads elsewhere", "doubted")
+    times = float(re.search(r"squared error is (\S+) times", row.evidence)[1])
+    declared = re.search(r'\("rate", "upper", ([^)]+)\), Disturbance\("rate", "lower", ([^)]+)\)', row.remedy)
+    rates = tuple(Disturbance("rate", name, float(declared[i])) for i, name in ((1, "upper"), (2, "lower")))
+    # what the row recommends does what it says
+    other = kit.with_disturbances(rates)
+    (better,) = p.set_points(other, [])
+    loads = [p._load_rate(one, 1, 0.1) for one in (point, better)]
+    found = p._mean_square(better, loads[1]) / p._mean_square(point, loads[0])
+    assert found == pytest.approx(times, rel=0.1)
+    assert found < 1.0 / p.GAINS
+    assert p.loads_elsewhere(other, better) is None
+
+
+def test_loads_that_the_disturbances_represent_have_no_row(good):
+    assert p.loads_elsewhere(good[0], point_of(good[0])) is None
+    states = OCP(30, [0.0, 10.0], [0.0], [0.1], [0.0], [3.0])
+    kit = kit_of(two_tanks(), states)
+    assert p.loads_elsewhere(kit, p.set_points(kit, [])[0]) is None
+
+
 # Every other promise, broken once.
 
 
@@ -212,7 +256,7 @@ def test_the_error_of_the_run_s_own_hold_task_is_a_doubt():
     end = p.TaskEnd("hold", (p.Deviation(angle, 0.1, -4.4, 0.1),))
     row = p.tasks_end([end], "on the model hybrid, not the machine")
     assert row.verdict == "doubted"
-    assert "hold: angle 4.4 deg off (noise 0.1 deg)" in row.evidence
+    assert "hold: angle offset 4.4 deg (noise 0.1 deg)" in row.evidence
     swings = replace(end, deviations=(p.Deviation(angle, 0.1, 0.0, 2.0),))
     assert p.tasks_end([swings], "").verdict == "doubted"
     lost = replace(end, deviations=(p.Deviation(angle, 0.1, np.nan, np.nan),))
@@ -344,7 +388,7 @@ ROW = Promise("step time", "doubted", "99 % of the steps take 19 ms", "Solver na
 def test_a_kit_reads_its_table_and_says_where_it_does_not_fit(artifact):
     old = load(artifact)
     assert [row.verdict for row in old.promises] == ["not promised"]
-    assert "holds no table" in old.promises[0].evidence
+    assert "contains no table" in old.promises[0].evidence
     write_promises(artifact, PromiseTable(old.identity, (ROW,)))
     kit = load(artifact)
     assert kit.promises == (ROW,)

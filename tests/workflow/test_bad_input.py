@@ -41,7 +41,7 @@ DAMAGE = {
     "short": (lambda lines: lines[:40], ["bad.csv", "s"]),
     "coarse": (made(400, 0.2, constant, np.sin), ["bad.csv", "max_gap"]),
     "degrees": (made(2000, 0.01, constant, lambda t: 40 * np.sin(t)),
-                ["bad.csv", "phi", "In deg it would be plausible", "units={'phi_rad': 'deg'}"]),
+                ["bad.csv", "phi", "units={'phi_rad': 'deg'}"]),
     "empty": (lambda lines: [], ["bad.csv", "empty"]),
     "idle": (made(2000, 0.01, constant, lambda t: 0.3 * np.sin(t)), ["bad", "tau", "0.1", "HM-DATA-021"]),
     "still": (made(2000, 0.01, lambda t: 0.1 * np.sin(t), lambda t: 0.3), ["bad", "phi", "never moved"]),
