@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hybrid_mpc.records import BESIDE
+from hybrid_mpc.workflow import control
 from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, Results
 
 SIMPLE = {float: "number", int: "whole number", str: "text", bool: "true or false", Any: "any"}
@@ -21,8 +22,8 @@ HEAD = f"""# `results.json`
 
 `hybrid-mpc run` writes its numbers to `results.json`: one object for each stage of the run, with the fields of the
 stage's dataclass. In Python, `read_results` (`hybrid_mpc/workflow/stages/results.py`) checks a file and returns the
-dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-mpc control` has
-[another schema](control-results.md).
+dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-mpc control` is
+[below](#hybrid-mpc-control).
 
 `python docs/site/results_schema.py > docs/results-schema.md` writes this page from the dataclasses.
 
@@ -41,10 +42,16 @@ dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-m
 - Unknown keys are refused, and files of another schema version too. `hybrid-mpc run SCENARIO --out FOLDER --resume`
   writes the file again.
 """
+CONTROL = f"""## `hybrid-mpc control`
+
+The `results.json` of [`hybrid-mpc control`](control.md) is the dataclass `ControlResults`. In Python, `read_control`
+(`hybrid_mpc/workflow/control.py`) reads it. Schema version: **{control.SCHEMA_VERSION}**.
+"""
 VERSIONS = """## Versions
 
 | version | differs from the one before |
 | --- | --- |
+| 13 | has the modes of linearized models in "analysis"; no "plants" in "on_model": its rows name them |
 | 12 | has the stages' own dataclasses; rows of all loops in place of their means |
 | 11 | has "watch" in place of "residuals", "monitor" and "guard" |
 | 10 | has "promises" |
@@ -139,6 +146,8 @@ def page() -> str:
     for name, kind in stages.items():
         lines += [f"## `{name}`", "", summary(kind), "", *table(kind, fields_of(kind)), ""]
         ahead += [k for hint in typing.get_type_hints(kind).values() for k in inner(hint)]
+    lines += [CONTROL, *table(control.ControlResults, fields_of(control.ControlResults)), ""]
+    ahead += [k for hint in typing.get_type_hints(control.ControlResults).values() for k in inner(hint)]
     lines += ["## Objects in them", ""]
     seen: set[Any] = set()
     while ahead:

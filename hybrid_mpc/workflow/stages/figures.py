@@ -29,7 +29,7 @@ from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION, finite
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.identify import PRIOR, TRAINING, trained_models
-from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, by_controller
+from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.workflow.stages.watch import WATCH, clean_windows, read_trace
 
 Figures = dict[str, list[tuple[Path, str]]]
@@ -240,14 +240,13 @@ def _on_model(context: Context) -> Any:
         return
     scenario = context.ready
     tasks = {task.name: task for task in scenario.tasks}
-    for name, rows in by_controller(found.drawn).items():
-        for row in rows:
-            task = tasks[row.task]
-            control = task.control or scenario.control
-            assert control is not None
-            title = f"{task.title}, {name}, {ON_MODEL} ({row.on_model})"
-            figure = loop_figure(title, control, scenario.prior(), {f"{name} on {row.on_model}": row.arrays})
-            yield "on_model", f"on_model_{task.name}_{name}", figure, f"{title}; first seed."
+    for row in sorted(found.drawn, key=lambda row: OBSERVERS.index(row.controller)):
+        task, name = tasks[row.task], row.controller
+        control = task.control or scenario.control
+        assert control is not None
+        title = f"{task.title}, {name}, {ON_MODEL} ({row.on_model})"
+        figure = loop_figure(title, control, scenario.prior(), {f"{name} on {row.on_model}": row.arrays})
+        yield "on_model", f"on_model_{task.name}_{name}", figure, f"{title}; first seed."
 
 
 def _overview(context: Context) -> Any:

@@ -135,9 +135,7 @@ def _loops(context: Context, controller: str) -> tuple[list[LoopRow], str]:
     """The run's loops of a controller with their kept signals, and a text that names their plant."""
     control, on_model = context.find(CONTROL), context.find(LOOPS_ON_MODEL)
     if not isinstance(control, Absent) and control.rows:
-        drawn = {(row.task, row.controller, row.seed): row for row in control.drawn}
-        rows = [drawn.get((row.task, row.controller, row.seed), row) for row in control.rows]
-        return [row for row in rows if row.controller == controller], "on the scenario's plant"
+        return [row for row in control.kept if row.controller == controller], "on the scenario's plant"
     if isinstance(on_model, Absent):
         return [], ""
     rows = [row for row in on_model.drawn if row.controller == controller]

@@ -15,7 +15,7 @@ from hybrid_mpc.compare.controllers import CONTROLLERS
 from hybrid_mpc.compare.loops import DRAWN_PRIOR, ON_MODEL
 from hybrid_mpc.compare.sequential import SAME, hardest
 from hybrid_mpc.compare.step_response import step_responses
-from hybrid_mpc.compare.summary import Summary
+from hybrid_mpc.compare.summary import StepTimes, Summary
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.evaluate import OutputErrors
@@ -32,7 +32,7 @@ from hybrid_mpc.workflow.stages.advice import advice, doubt_of
 from hybrid_mpc.workflow.stages.analyze import AnalysisResult
 from hybrid_mpc.workflow.stages.answers import answer_all
 from hybrid_mpc.workflow.stages.choose import CHOICE, ChoiceResult
-from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, StepTimes, closed_loops
+from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, closed_loops
 from hybrid_mpc.workflow.stages.estimate import EstimationResult
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult, finite
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
@@ -534,7 +534,8 @@ def _response_table(context: Context, found: ControlResult) -> Table:
 def _on_model_tables(found: OnModelResult) -> list[Table]:
     """One table for each controller: their plants differ, so one table must not compare two controllers."""
     tables = []
-    for name, cells in found.means.items():
+    for name, plant in found.plants.items():
+        cells = {task: own[name] for task, own in found.means.items()}
         signals, errors = _tracking(list(cells.values()))
         rows = [
             (task, _cost(cell), *own, f"{100 * max(cell.limits.values(), default=0.0):.0f} %",
@@ -542,7 +543,7 @@ def _on_model_tables(found: OnModelResult) -> list[Table]:
             for (task, cell), own in zip(cells.items(), errors, strict=True)
         ]  # fmt: skip
         caption = (
-            f"Controller {name.replace('_', ', ')} on the model {found.plants[name]} in place of the machine: "
+            f"Controller {name.replace('_', ', ')} on the model {plant} in place of the machine: "
             f"{ON_MODEL}. Cost J on the model's state, root mean square deviations from the reference, means over "
             "seeds."
         )
