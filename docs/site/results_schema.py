@@ -17,7 +17,14 @@ from hybrid_mpc.records import BESIDE
 from hybrid_mpc.workflow import control
 from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, Results
 
-SIMPLE = {float: "number", int: "whole number", str: "text", bool: "true or false", Any: "any"}
+SIMPLE = {
+    float: "number",
+    int: "whole number",
+    str: "text",
+    bool: "true or false",
+    Any: "any",
+    complex: "list (real part, imaginary part)",
+}
 HEAD = f"""# `results.json`
 
 `hybrid-mpc run` writes its numbers to `results.json`: one object for each stage of the run, with the fields of the

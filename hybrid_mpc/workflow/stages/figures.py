@@ -350,7 +350,7 @@ def _analysis(context: Context) -> Any:
     if isinstance(found, Absent):
         return
     arrays = found.arrays
-    poles = {n: np.array([complex(*z) for z in found.models[n].rest.poles]) for n in ("prior", "hybrid")}
+    poles = {n: [mode.pole for mode in found.models[n].points["rest"]] for n in ("prior", "hybrid")}
     figure = analysis.pole_map(poles, context.spec.dt)
     yield "analysis", "poles", figure, "Poles of the one-step maps at rest."
     prior = context.scenario.prior()
@@ -359,15 +359,10 @@ def _analysis(context: Context) -> Any:
     for point in ("rest", "moving"):
         if any(point not in found.models[n].points for n in poles):
             continue  # a network that corrects every rate leaves no signal that is exactly a speed
-        for (i, output), (j, into) in product(enumerate(prior.outputs), enumerate(prior.inputs)):
-            responses = {}
-            for n in poles:
-                omega, size, phase = (arrays[f"{n}/{point}/{k}"] for k in ("omega", "magnitude", "phase"))
-                responses[n] = omega, size[i, j], phase[i, j]
-            figure = analysis.bode(
-                responses, input_signal=into, output_signal=output, nyquist=np.pi / context.spec.dt
-            )
-            several = len(prior.outputs) * len(prior.inputs) > 1
-            named = f"bode_{point}_from_{into.name}_to_{output.name}" if several else f"bode_{point}"
-            channel = f", from {into.name} to {output.name}" if several else ""
-            yield "analysis", named, figure, f"Bode plot of prior and hybrid {titles[point]}{channel}."
+        responses = {
+            n: (arrays[f"{n}/{point}/omega"], arrays[f"{n}/{point}/magnitude"], arrays[f"{n}/{point}/phase"])
+            for n in poles
+        }
+        for named, channel, figure in analysis.bodes(responses, prior.inputs, prior.outputs, context.spec.dt):
+            caption = f"Bode plot of prior and hybrid {titles[point]}{channel}."
+            yield "analysis", f"bode_{point}{named}", figure, caption

@@ -11,6 +11,7 @@ from typing import Any
 
 from scipy.stats import chi2
 
+from hybrid_mpc.analyze.properties import stabilisable_detectable
 from hybrid_mpc.compare.controllers import CONTROLLERS
 from hybrid_mpc.compare.loops import DRAWN_PRIOR, ON_MODEL
 from hybrid_mpc.compare.sequential import SAME, hardest
@@ -29,7 +30,7 @@ from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.advice import advice, doubt_of
-from hybrid_mpc.workflow.stages.analyze import AnalysisResult
+from hybrid_mpc.workflow.stages.analyze import LinearizedModels
 from hybrid_mpc.workflow.stages.answers import answer_all
 from hybrid_mpc.workflow.stages.choose import CHOICE, ChoiceResult
 from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, closed_loops
@@ -688,13 +689,13 @@ def _delays_of(faults: Sequence[FaultedLoop]) -> tuple[str, str]:
     return "; ".join(after), "; ".join(causes)
 
 
-def _pole_table(analysis: AnalysisResult) -> Table:
+def _pole_table(analysis: LinearizedModels) -> Table:
     rows = []
     for model, found in analysis.models.items():
-        for point, a in found.points.items():
-            slow = [f"{number(w)} ({z:.2f})" for w, z in
-                    list(zip(a.frequency_rad_s, a.damping, strict=True))[:2] if w is not None]  # fmt: skip
-            rows.append((model, point, ", ".join(slow), a.stable, a.stabilisable, a.detectable))
+        for point, own in found.points.items():
+            slow = [f"{number(m.frequency)} ({m.damping:.2f})" for m in own[:2] if m.pole != 0]
+            stable = all(abs(m.pole) < 1.0 for m in own)
+            rows.append((model, point, ", ".join(slow), stable, *stabilisable_detectable(own)))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
     points = {"rest": "at rest", "moving": "at working speed"}
     there = [points[p] for p in points if any(p in found.points for found in analysis.models.values())]

@@ -10,7 +10,7 @@ from typing import Any
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explained import ExplainResult
 from hybrid_mpc.workflow.stage import Absent, Stage, read_as
-from hybrid_mpc.workflow.stages.analyze import ANALYSIS, AnalysisResult
+from hybrid_mpc.workflow.stages.analyze import ANALYSIS, LinearizedModels
 from hybrid_mpc.workflow.stages.choose import CHOICE, ChoiceResult
 from hybrid_mpc.workflow.stages.compare import CONTROL, ControlResult
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION, EstimationResult
@@ -77,7 +77,7 @@ class Results:
     estimation: EstimationResult | Absent
     promises: PromisesResult | Absent
     watch: WatchResult | Absent
-    analysis: AnalysisResult | Absent
+    analysis: LinearizedModels | Absent
 
 
 def collect(context: Context) -> Results:
