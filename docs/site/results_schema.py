@@ -58,7 +58,7 @@ VERSIONS = """## Versions
 
 | version | differs from the one before |
 | --- | --- |
-| 13 | has the modes of linearized models in "analysis"; no "plants" in "on_model": its rows name them |
+| 13 | has modes of linearized models in "analysis", "nis_band" in "estimation"; "plants" of "on_model" is gone |
 | 12 | has the stages' own dataclasses; rows of all loops in place of their means |
 | 11 | has "watch" in place of "residuals", "monitor" and "guard" |
 | 10 | has "promises" |
@@ -131,6 +131,12 @@ def inner(hint: Any) -> Iterator[Any]:
         yield from inner(arm)
 
 
+def parts(kind: Any) -> list[Any]:
+    """Dataclasses in the fields of a dataclass that the file holds."""
+    hints = typing.get_type_hints(kind)
+    return [part for name in fields_of(kind) for part in inner(hints[name])]
+
+
 def table(kind: Any, names: list[str]) -> Iterator[str]:
     """Rows of some fields of a dataclass."""
     hints, texts = typing.get_type_hints(kind), meanings(kind)
@@ -152,9 +158,9 @@ def page() -> str:
     ahead: list[Any] = []
     for name, kind in stages.items():
         lines += [f"## `{name}`", "", summary(kind), "", *table(kind, fields_of(kind)), ""]
-        ahead += [k for hint in typing.get_type_hints(kind).values() for k in inner(hint)]
+        ahead += parts(kind)
     lines += [CONTROL, *table(control.ControlResults, fields_of(control.ControlResults)), ""]
-    ahead += [k for hint in typing.get_type_hints(control.ControlResults).values() for k in inner(hint)]
+    ahead += parts(control.ControlResults)
     lines += ["## Objects in them", ""]
     seen: set[Any] = set()
     while ahead:
@@ -162,7 +168,7 @@ def page() -> str:
         if kind not in seen:
             seen.add(kind)
             lines += [f"### {kind.__name__}", "", summary(kind), "", *table(kind, fields_of(kind)), ""]
-            ahead += [k for hint in typing.get_type_hints(kind).values() for k in inner(hint)]
+            ahead += parts(kind)
     return "\n".join([*lines, VERSIONS])
 
 

@@ -302,7 +302,7 @@ def _estimation(context: Context) -> Any:
             continue
         figure = estimation.innovations(
             [arrays[f"{name}/nis/{i}"] for i in range(len(found.recordings))], arrays[f"{name}/autocorrelation"],
-            dt=context.spec.dt, outputs=context.scenario.prior().outputs, mean_band=(own.nis_low, own.nis_high),
+            dt=context.spec.dt, outputs=context.scenario.prior().outputs, mean_band=own.nis_band,
             correlation_band=own.correlation_band, title=OBSERVER_TITLES[name],
         )  # fmt: skip
         caption = f"{OBSERVER_TITLES[name]}: innovations on test recordings."

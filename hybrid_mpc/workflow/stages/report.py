@@ -571,7 +571,7 @@ def _cost(cell: Summary | None) -> str:
 
 def _observer_table(found: EstimationResult) -> Table:
     rows = [
-        (OBSERVER_TITLES[name], r.mean_nis, f"{r.nis_low:.2f} to {r.nis_high:.2f}", f"{100 * r.nis_inside:.0f} %",
+        (OBSERVER_TITLES[name], r.mean_nis, "{:.2f} to {:.2f}".format(*r.nis_band), f"{100 * r.nis_inside:.0f} %",
          f"{r.ljung_box:.0f}", f"{r.ljung_box_limit:.0f}", r.samples)
         for name, r in found.observers.items()
         if not isinstance(r, Absent)

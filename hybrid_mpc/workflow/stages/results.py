@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hybrid_mpc.kit.promises import PromiseTable
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explained import ExplainResult
 from hybrid_mpc.workflow.stage import Absent, Stage, read_as
@@ -19,7 +20,7 @@ from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, ExportResult, NoiseResult
 from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, DataResult, PriorResult, TrainingResult
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, OnModelResult
-from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult
+from hybrid_mpc.workflow.stages.promises import PROMISES
 from hybrid_mpc.workflow.stages.track import TRACK, TrackResult
 from hybrid_mpc.workflow.stages.watch import WATCH, WatchResult
 
@@ -75,7 +76,7 @@ class Results:
     control: ControlResult | Absent
     on_model: OnModelResult | Absent
     estimation: EstimationResult | Absent
-    promises: PromisesResult | Absent
+    promises: PromiseTable | Absent
     watch: WatchResult | Absent
     analysis: LinearizedModels | Absent
 
