@@ -58,7 +58,7 @@ VERSIONS = """## Versions
 
 | version | differs from the one before |
 | --- | --- |
-| 13 | has modes of linearized models in "analysis", "nis_band" in "estimation"; "plants" of "on_model" is gone |
+| 13 | modes in "analysis", "nis_band" in "estimation", alarms by recording in "watch"; no "plants" in "on_model" |
 | 12 | has the stages' own dataclasses; rows of all loops in place of their means |
 | 11 | has "watch" in place of "residuals", "monitor" and "guard" |
 | 10 | has "promises" |

@@ -12,7 +12,8 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.rules import two_digits
 
 if TYPE_CHECKING:
-    from hybrid_mpc.workflow.monitor import MonitorJob, MonitorResult, RecordingResult
+    from hybrid_mpc.watch.explain import WatchedRecording
+    from hybrid_mpc.workflow.monitor import MonitorJob, MonitorResult
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -134,7 +135,7 @@ def summary(result: MonitorResult) -> list[str]:
     return lines
 
 
-def _invalid(row: RecordingResult) -> str:
+def _invalid(row: WatchedRecording) -> str:
     parts = (
         (row.warm_up_s, "warm-up"),
         (row.missing_s, "samples are missing"),

@@ -19,7 +19,7 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.watch.detector import WatchLimits
-from hybrid_mpc.watch.explain import Alarm, explained, table
+from hybrid_mpc.watch.explain import WatchedRecording, explained, table
 from hybrid_mpc.watch.learn import learn_limits
 from hybrid_mpc.watch.lengths import rest_speeds
 from hybrid_mpc.watch.monitor import Monitor, make_monitor, make_readings, reads_energy
@@ -28,25 +28,10 @@ from hybrid_mpc.watch.replay import EstimatorLike, along
 
 
 @dataclass(frozen=True)
-class RecordingResult:
-    """Alarms on a recording, and the time [s] without valid readings: the window was not full (``warm_up_s``), samples
-    were missing, or model or estimator gave a non-finite value.
-    """
-
-    recording: str
-    seconds: float
-    valid_s: float
-    warm_up_s: float
-    missing_s: float
-    not_finite_s: float
-    alarms: tuple[Alarm, ...]
-
-
-@dataclass(frozen=True)
 class MonitorResult:
     """Results of :func:`watch` for each recording, gaps of the recordings, and parts too short for the monitor."""
 
-    recordings: tuple[RecordingResult, ...]
+    recordings: tuple[WatchedRecording, ...]
     gaps: tuple[Cut, ...]
     not_watched: tuple[Cut, ...]
 
@@ -191,7 +176,7 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
     for recording, report in along(job.data.whole, progress.update):
         name, seconds = recording.name.replace("#", "_"), len(recording.t) * recording.dt
         trace, alarms = explained(monitor, job.estimator, recording, diagnoser, report)
-        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
+        rows.append(WatchedRecording(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
         write_text(out / f"{name}.csv", table(trace, recording.y, job.model.outputs, monitor))
         notes = [(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis]
         figure = channels(

@@ -333,7 +333,7 @@ def _watch(context: Context) -> Any:
     whole = {r.name: r for r in context.dataset.whole}
     for name in found.shown:
         windows = clean_windows(context, whole[name], ("train", "valid", "test", "nominal"))
-        notes = [(a.start_s, a.diagnosis) for a in found.alarms if a.file == name and a.diagnosis]
+        notes = [(a.start_s, a.diagnosis) for of, a in found.alarms if of == name and a.diagnosis]
         figure = drawn(name, windows=windows, notes=notes, title=name)
         caption = f"The monitor over the whole recording {name}."
         yield "watch", f"monitor_{name.replace('#', '-')}", figure, caption

@@ -26,6 +26,7 @@ from hybrid_mpc.records import plain
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
 from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.explain import WatchedRecording
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
@@ -43,7 +44,7 @@ from hybrid_mpc.workflow.stages.identify import DATA, DataResult, models_of, tra
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect
 from hybrid_mpc.workflow.stages.track import TrackResult
-from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchedRecording, WatchResult
+from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 
 TITLES: Mapping[str, str] = {
     "promises": "What this kit promises",
@@ -312,7 +313,7 @@ def coverage_words(recordings: Sequence[WatchedRecording]) -> tuple[str, ...]:
     """A sentence on parts of the recordings that were not monitored, warm-up apart; empty without such a part.
 
     Example:
-        >>> coverage_words([WatchedRecording("monday", valid_s=4.0, warm_up_s=0.3, missing_s=0.0, not_finite_s=2.0)])
+        >>> coverage_words([WatchedRecording("monday", 6.3, 4.0, 0.3, missing_s=0.0, not_finite_s=2.0, alarms=())])
         ('Not monitored: 2 s with a non-finite value of model or estimator.',)
     """
     sums = {
@@ -627,7 +628,9 @@ def _watch_tables(found: WatchResult) -> list[Table]:
         tables.append(
             Table(heads, rows, f"Closed loops of the task {found.faults[0].task} with a simulated fault.")
         )
-    alarms = [(a.file, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for a in found.alarms]
+    alarms = [
+        (name, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for name, a in found.alarms
+    ]
     heads = ("recording", "from [s]", "to [s]", "channels", "diagnosis")
     return [*tables, Table(heads, alarms, "Alarms over the whole recordings.")]
 
