@@ -131,7 +131,7 @@ def summary(result: MonitorResult) -> list[str]:
             of = f" ({', '.join(alarm.channels)})" if alarm.channels else ""
             lines.append(f"  {alarm.start_s:.2f} to {alarm.end_s:.2f} s{of}{why}")
     for what, cuts in (("gap", result.gaps), ("not monitored", result.not_watched)):
-        lines += [f"{what} in {cut.file}: {cut.start:.2f} to {cut.end:.2f} s, {cut.why}" for cut in cuts]
+        lines += [f"{what} in {cut.file}: {cut.start_s:.2f} to {cut.end_s:.2f} s, {cut.why}" for cut in cuts]
     return lines
 
 

@@ -29,11 +29,27 @@ from hybrid_mpc.watch.replay import EstimatorLike, along
 
 @dataclass(frozen=True)
 class MonitorResult:
-    """Results of :func:`watch` for each recording, gaps of the recordings, and parts too short for the monitor."""
+    """Results of :func:`watch`, content of ``monitor.json``.
 
+    Args:
+        kind: Kind of readings.
+        recordings: The recordings with their alarms.
+        warnings: Warnings about the recordings.
+        notes: How files were read that needed more than a plain table.
+        gaps: Gaps of the recordings.
+        not_watched: Parts too short for the monitor.
+        limits: Limits of the channels.
+        data_hash: Hash of the recordings.
+    """
+
+    kind: str
     recordings: tuple[WatchedRecording, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
     gaps: tuple[Cut, ...]
     not_watched: tuple[Cut, ...]
+    limits: WatchLimits | None
+    data_hash: str
 
 
 @dataclass(frozen=True)
@@ -123,7 +139,7 @@ def prepared(
     spec = replace(spec, windows={}, warm_up=spec.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(recordings, watched, spec, needed=())
     if not data.whole:
-        cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
+        cut = "; ".join(f"{c.file} {c.start_s:g} to {c.end_s:g} s: {c.why}" for c in data.cuts)
         raise InputError(
             f"recordings: every part is too short for the monitor: {cut}. Give longer recordings [HM-WORKFLOW-025]"
         )
@@ -184,16 +200,10 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
         )
         save(figure, out / f"{name}.png")
     progress.finish("")
-    gaps, short = ([cut for cut in job.data.cuts if ("gap" in cut.why) is gap] for gap in (True, False))
-    result = {
-        "kind": job.kind,
-        "recordings": rows,
-        "warnings": job.data.warnings,
-        "notes": job.data.notes,
-        "gaps": [cut._asdict() for cut in gaps],
-        "not_watched": [cut._asdict() for cut in short],
-        "limits": job.limits,
-        "data_hash": job.data.hash,
-    }
+    data = job.data
+    gaps, short = (tuple(cut for cut in data.cuts if ("gap" in cut.why) is gap) for gap in (True, False))
+    result = MonitorResult(
+        job.kind, tuple(rows), data.warnings, data.notes, gaps, short, job.limits, data.hash
+    )
     write_json(out / "monitor.json", result)
-    return MonitorResult(tuple(rows), tuple(gaps), tuple(short))
+    return result
