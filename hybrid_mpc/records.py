@@ -52,8 +52,8 @@ def plain(value: Any) -> Any:
     """``value`` in JSON's own types.
 
     Dataclasses (without the fields marked :data:`BESIDE`) and mappings become objects, sequences and arrays lists,
-    paths texts, non-finite numbers ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi function its program (InputError
-    if it has no program).
+    complex numbers lists of two, paths texts, non-finite numbers ``"inf"``, ``"-inf"`` and ``"nan"``, and a CasADi
+    function its program (InputError if it has no program).
 
     Example:
         >>> plain({"x": np.array([1.0, np.inf]), "where": Path("a")})
@@ -72,6 +72,8 @@ def plain(value: Any) -> Any:
         return str(value)
     if isinstance(value, Path):
         return str(value)
+    if isinstance(value, complex):
+        return [plain(value.real), plain(value.imag)]
     if type(value) is _function():
         return _program(value)
     return value
@@ -400,6 +402,12 @@ def _float(value: object) -> tuple[float] | None:
     return None if whole is None else (float(whole[0]),)
 
 
+def _complex(value: object) -> tuple[complex] | None:
+    parts = value if isinstance(value, list | tuple) and len(value) == 2 else ()
+    numbers = [found[0] for part in parts if (found := _float(part)) is not None]
+    return (complex(*numbers),) if len(numbers) == 2 else (value,) if isinstance(value, complex) else None
+
+
 def _int(value: object) -> tuple[int] | None:
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         return None
@@ -413,5 +421,6 @@ _SIMPLE: Mapping[Any, tuple[Any, str]] = {
     str: (lambda v: (v,) if isinstance(v, str) else None, "a text"),
     bool: (lambda v: (v,) if isinstance(v, bool) else None, "true or false"),
     type(None): (lambda v: (None,) if v is None else None, "null"),
+    complex: (_complex, "a real and an imaginary part in a list"),
     Path: (lambda v: (Path(v),) if isinstance(v, str | Path) else None, "a path"),
 }

@@ -29,11 +29,11 @@ from hybrid_mpc.kit.parts import (
 from hybrid_mpc.kit.parts import (
     TASKS as TASK_LIST,
 )
-from hybrid_mpc.kit.promises import Promise, read_promises
+from hybrid_mpc.kit.promises import Promise, PromiseTable, read_promises
 from hybrid_mpc.workflow import run as job
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, TASKS, ExportResult, NoiseResult, put_noise
-from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult, put_promises
+from hybrid_mpc.workflow.stages.promises import PROMISES, put_promises
 from hybrid_mpc.workflow.stages.watch import WATCH, WatchResult, put_limits
 
 ROOT = Path(__file__).parents[1]
@@ -105,7 +105,7 @@ def fake_stages(sources):
 
     def promises(context):
         rows = (Promise("p", "shown", f"{limit(context):g}"),)
-        return kept(put_promises, context, PromisesResult(rows, context.kit.identity))
+        return kept(put_promises, context, PromiseTable(rows, context.kit.identity))
 
     def kept(put, context, found):
         assert put(context, found) == ""

@@ -14,15 +14,23 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hybrid_mpc.records import BESIDE
+from hybrid_mpc.workflow import control
 from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, Results
 
-SIMPLE = {float: "number", int: "whole number", str: "text", bool: "true or false", Any: "any"}
+SIMPLE = {
+    float: "number",
+    int: "whole number",
+    str: "text",
+    bool: "true or false",
+    Any: "any",
+    complex: "list (real part, imaginary part)",
+}
 HEAD = f"""# `results.json`
 
 `hybrid-mpc run` writes its numbers to `results.json`: one object for each stage of the run, with the fields of the
 stage's dataclass. In Python, `read_results` (`hybrid_mpc/workflow/stages/results.py`) checks a file and returns the
-dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-mpc control` has
-[another schema](control-results.md).
+dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-mpc control` is
+[below](#hybrid-mpc-control).
 
 `python docs/site/results_schema.py > docs/results-schema.md` writes this page from the dataclasses.
 
@@ -41,10 +49,16 @@ dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-m
 - Unknown keys are refused, and files of another schema version too. `hybrid-mpc run SCENARIO --out FOLDER --resume`
   writes the file again.
 """
+CONTROL = f"""## `hybrid-mpc control`
+
+The `results.json` of [`hybrid-mpc control`](control.md) is the dataclass `ControlResults`. In Python, `read_control`
+(`hybrid_mpc/workflow/control.py`) reads it. Schema version: **{control.SCHEMA_VERSION}**.
+"""
 VERSIONS = """## Versions
 
 | version | differs from the one before |
 | --- | --- |
+| 13 | modes in "analysis", "nis_band" in "estimation", alarms by recording in "watch"; no "plants" in "on_model" |
 | 12 | has the stages' own dataclasses; rows of all loops in place of their means |
 | 11 | has "watch" in place of "residuals", "monitor" and "guard" |
 | 10 | has "promises" |
@@ -117,6 +131,12 @@ def inner(hint: Any) -> Iterator[Any]:
         yield from inner(arm)
 
 
+def parts(kind: Any) -> list[Any]:
+    """Dataclasses in the fields of a dataclass that the file holds."""
+    hints = typing.get_type_hints(kind)
+    return [part for name in fields_of(kind) for part in inner(hints[name])]
+
+
 def table(kind: Any, names: list[str]) -> Iterator[str]:
     """Rows of some fields of a dataclass."""
     hints, texts = typing.get_type_hints(kind), meanings(kind)
@@ -138,7 +158,9 @@ def page() -> str:
     ahead: list[Any] = []
     for name, kind in stages.items():
         lines += [f"## `{name}`", "", summary(kind), "", *table(kind, fields_of(kind)), ""]
-        ahead += [k for hint in typing.get_type_hints(kind).values() for k in inner(hint)]
+        ahead += parts(kind)
+    lines += [CONTROL, *table(control.ControlResults, fields_of(control.ControlResults)), ""]
+    ahead += parts(control.ControlResults)
     lines += ["## Objects in them", ""]
     seen: set[Any] = set()
     while ahead:
@@ -146,7 +168,7 @@ def page() -> str:
         if kind not in seen:
             seen.add(kind)
             lines += [f"### {kind.__name__}", "", summary(kind), "", *table(kind, fields_of(kind)), ""]
-            ahead += [k for hint in typing.get_type_hints(kind).values() for k in inner(hint)]
+            ahead += parts(kind)
     return "\n".join([*lines, VERSIONS])
 
 

@@ -150,7 +150,6 @@ class Linearization:
 
     Args:
         structure: Modes with their controllability and observability.
-        poles: Poles, largest first.
         zeros: Zeros of a system with as many inputs as outputs, else empty.
         response: Frequency response.
         t: Times of the step responses ``(k,)`` [s].
@@ -160,7 +159,6 @@ class Linearization:
     """
 
     structure: Structure
-    poles: Complex
     zeros: Complex
     response: FrequencyResponse
     t: Array
@@ -432,7 +430,6 @@ def _linearization(given: AnalysisInput, model: HybridModel, point: Point, syste
     step = control_toolbox().step_response(system, t).outputs
     return Linearization(
         structure,
-        np.array([m.pole for m in structure.modes]),
         _zeros(system) if model.n_u == model.n_y else np.zeros(0, dtype=complex),
         frequency_response(system, omega),
         t,

@@ -69,7 +69,7 @@ def write_analysis(
 
 
 def flattened(value: Any, path: str = "") -> tuple[Any, dict[str, Any]]:
-    """Split a result into numbers for JSON and arrays by their path; a complex number becomes ``[re, im]``.
+    """Split a result into numbers for JSON and arrays by their path.
 
     Example:
         >>> numbers, arrays = flattened({"a": {"gain": np.ones(2), "pole": 0.5 + 0.1j}})
@@ -78,15 +78,11 @@ def flattened(value: Any, path: str = "") -> tuple[Any, dict[str, Any]]:
     """
     if isinstance(value, np.ndarray):
         return None, {path: value}
-    if isinstance(value, complex):
-        return [value.real, value.imag], {}
     items: list[tuple[str, Any]]
     if is_dataclass(value):
         items = [(f.name, getattr(value, f.name)) for f in fields(value)]
     elif isinstance(value, Mapping):
         items = list(value.items())
-    elif hasattr(value, "_asdict"):
-        items = list(value._asdict().items())
     elif isinstance(value, list | tuple):
         items = [(str(i), one) for i, one in enumerate(value)]
     else:
@@ -98,8 +94,7 @@ def flattened(value: Any, path: str = "") -> tuple[Any, dict[str, Any]]:
         arrays |= curves
         if not isinstance(one, np.ndarray):
             numbers[name] = own
-    named = not isinstance(value, list | tuple) or hasattr(value, "_asdict")
-    return numbers if named else list(numbers.values()), arrays
+    return list(numbers.values()) if isinstance(value, list | tuple) else numbers, arrays
 
 
 # Tables.
@@ -292,10 +287,10 @@ def _draw_linear(given: AnalysisInput, part: Mapping[str, Mapping[str, Lineariza
     some, names = _some(given), _names(given)
     here = [point for point in POINTS if point in part[names[0]]]
     for point, name in (("rest", "poles"), ("driven", "poles_driven")):
-        poles, zeros = ({n: getattr(part[n][point], kind) for n in names} for kind in ("poles", "zeros"))
+        poles = {n: part[n][point].structure.poles for n in names}
+        zeros = {n: part[n][point].zeros for n in names}
         caption = f"Poles and zeros of the linearizations {TITLES[point]}."
         yield name, plots.pole_map(poles, some.dt, zeros=zeros), caption
-    every = list(product(range(some.n_y), range(some.n_u)))
     for point in here:
         responses = {}
         for name in names:
@@ -304,31 +299,15 @@ def _draw_linear(given: AnalysisInput, part: Mapping[str, Mapping[str, Lineariza
             if isinstance(reduced, Reduction):
                 responses[f"{name}, reduced to {some.n_x} states"] = reduced.response
         note = " A phase that rises at the resonance means negative damping." if point == "moving" else ""
-        for i, j in every:
-            curves = {label: (r.omega, r.magnitude[i, j], r.phase[i, j]) for label, r in responses.items()}
-            figure = plots.bode(
-                curves, input_signal=some.inputs[j], output_signal=some.outputs[i], nyquist=np.pi / some.dt
-            )
-            named, channel = _channel(some, i, j)
+        curves = {label: (r.omega, r.magnitude, r.phase) for label, r in responses.items()}
+        for named, channel, figure in plots.bodes(curves, some.inputs, some.outputs, some.dt):
             caption = f"Bode plot of the linearizations {TITLES[point]}{channel}.{note}"
             yield f"bode_{point}{named}", figure, caption
-    for i, j in every:
+    for i, j in product(range(some.n_y), range(some.n_u)):
         steps = {point: {n: (part[n][point].t, part[n][point].step[i, j]) for n in names} for point in here}
         figure = plots.step_responses(steps, input_signal=some.inputs[j], output_signal=some.outputs[i])
-        named, channel = _channel(some, i, j)
+        named, channel = plots.channel_words(some.inputs, some.outputs, i, j)
         yield f"steps{named}", figure, f"Unit step responses of the linearizations{channel}."
-
-
-CHANNEL = "_from_"
-"""Separates a figure's name from its channel, if there are several channels."""
-
-
-def _channel(some: HybridModel, i: int, j: int) -> tuple[str, str]:
-    """Parts of a figure's name and caption that name output ``i`` and input ``j``; empty for a single channel."""
-    if some.n_y * some.n_u == 1:
-        return "", ""
-    ends = some.inputs[j].name, some.outputs[i].name
-    return f"{CHANNEL}{ends[0]}_to_{ends[1]}", f", from {ends[0]} to {ends[1]}"
 
 
 def _draw_measured(given: AnalysisInput, part: ResponseAnalysis) -> Named:
@@ -351,7 +330,7 @@ def _draw_loops(given: AnalysisInput, part: Mapping[str, Mapping[str, Mapping[st
     some = _some(given)
     for signal in some.inputs:
         where = at_input(some, signal)
-        named = f"{CHANNEL}{signal.name}" if where else ""
+        named = f"{plots.CHANNEL}{signal.name}" if where else ""
         driven = {
             f"{loop}, {mode.removesuffix(where)}": row
             for loop, points in part.items()
@@ -389,7 +368,7 @@ def _draw_sensitivity(given: AnalysisInput, part: Mapping[str, SensitivityAnalys
         relative = {name: part[name].relative[:, i] for name in _names(given)}
         figure = plots.sensitivities(first.t, relative, first.parameters, output_signal=state)
         caption = f"Change of {state.name} in a free run per relative change of the prior's parameters."
-        yield f"sensitivity_parameters{CHANNEL}parameters_to_{state.name}", figure, caption
+        yield f"sensitivity_parameters{plots.CHANNEL}parameters_to_{state.name}", figure, caption
 
 
 def _names(given: AnalysisInput) -> list[str]:
@@ -429,7 +408,9 @@ def _sections(result: AnalysisResult, tables: Mapping[str, Table], drawn: Drawn)
         if isinstance(found, ResponseAnalysis):
             notes += [f"Left out: {name}: {why}." for name, why in found.left_out.items()]
         shown = [tables[n] if n != "modes" else _leading(tables[n]) for n in names if n in tables]
-        pictures = [own for f in figures for name, own in drawn.items() if name.partition(CHANNEL)[0] == f]
+        pictures = [
+            own for f in figures for name, own in drawn.items() if name.partition(plots.CHANNEL)[0] == f
+        ]
         sections.append(Section(title, texts[part], pictures, shown, notes))
     return sections
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,10 +24,11 @@ EDGE = 1e-9
 """Distance of a pole from the unit circle below which the pole has no Gramian and is kept."""
 
 
-class Mode(NamedTuple):
+@dataclass(frozen=True)
+class Mode:
     """One mode of a discrete system.
 
-    Attributes:
+    Args:
         pole: Pole z.
         frequency: Natural frequency of the continuous equivalent ``s = log(z) / dt`` [rad/s]; infinite for z = 0.
         damping: Damping ratio of the continuous equivalent [-]; 1 for z = 0 and z = 1.
@@ -87,6 +88,11 @@ class Structure:
     hankel: Array
     stabilisable: bool
     detectable: bool
+
+    @property
+    def poles(self) -> Complex:
+        """Poles ``(n,)``, largest first."""
+        return np.array([m.pole for m in self.modes])
 
 
 def system_structure(sys: Any) -> Structure:

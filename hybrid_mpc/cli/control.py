@@ -95,15 +95,15 @@ def control(
 
 def summary(results: ControlResults) -> list[str]:
     """One line per task and controller; for loops on models, a table per controller."""
-    if len(results.on_model) > 1:
-        parts = (_of_controller(results, name) for name in results.on_model)
+    if len(results.loops.plants) > 1:
+        parts = (_of_controller(results, name) for name in results.loops.plants)
         return [line for part in parts for line in summary(part)]
-    said = [f"{name} on the model {plant}, not the machine:" for name, plant in results.on_model.items()]
-    cells = [cell for row in results.summary.values() for cell in row.values()]
+    said = [f"{name} on the model {plant}, not the machine:" for name, plant in results.loops.plants.items()]
+    cells = [cell for row in results.loops.means.values() for cell in row.values()]
     signals = {s: max(len(s) + 5, 11) for s in dict.fromkeys(s for cell in cells for s in cell.tracking_rmse)}
     heads = " ".join(f"{'RMSE ' + s:>{width}}" for s, width in signals.items())
     lines = [*said, f"{'task':16} {'controller':16} {'cost':>10} {'95 %':>10} {heads} {'solved':>8}"]
-    for task, row in results.summary.items():
+    for task, row in results.loops.means.items():
         for name, cell in row.items():
             cost = cell.cost
             means = {s: found.mean for s, found in cell.tracking_rmse.items()}
@@ -112,21 +112,18 @@ def summary(results: ControlResults) -> list[str]:
                 f"{task:16} {name:16} {_number(cost.mean):>10} {_number(cost.ci95, '±'):>10} {errors} "
                 f"{100 * cell.sources['MPC']:>6.1f} %"
             )
-    lines += [line for row in results.loops if results.reaction for line in _guarded(row)]
+    lines += [line for row in results.loops.rows if results.note.study["guard"] for line in _guarded(row)]
     for name, times in results.step_ms.items():
         lines.append(
-            f"step time of {name}: median {time_text(times['median'])}, 99 % within {time_text(times['p99'])}, period "
-            f"{time_text(results.period_ms)}"
+            f"step time of {name}: median {time_text(times.median)}, 99 % within {time_text(times.p99)}, period "
+            f"{time_text(times.period)}"
         )
     return lines
 
 
 def _of_controller(results: ControlResults, name: str) -> ControlResults:
-    return replace(
-        results, on_model={name: results.on_model[name]}, step_ms={name: results.step_ms[name]},
-        summary={task: {name: cells[name]} for task, cells in results.summary.items()},
-        loops=tuple(row for row in results.loops if row.controller == name),
-    )  # fmt: skip
+    rows = tuple(row for row in results.loops.rows if row.controller == name)
+    return replace(results, step_ms={name: results.step_ms[name]}, loops=replace(results.loops, rows=rows))
 
 
 def _guarded(row: LoopRow) -> list[str]:

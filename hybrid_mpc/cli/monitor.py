@@ -12,7 +12,7 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.rules import two_digits
 
 if TYPE_CHECKING:
-    from hybrid_mpc.workflow.monitor import MonitorJob, MonitorResult, RecordingResult
+    from hybrid_mpc.workflow.monitor import MonitorJob, MonitorResult
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -124,23 +124,20 @@ def summary(result: MonitorResult) -> list[str]:
     lines = []
     for row in result.recordings:
         n = len(row.alarms)
-        lines.append(f"{row.recording}: {row.seconds:.1f} s, {n} alarm{'' if n == 1 else 's'}{_invalid(row)}")
+        parts = (
+            (row.warm_up_s, "warm-up"),
+            (row.missing_s, "samples are missing"),
+            (row.not_finite_s, "results of model or estimator are not finite"),
+        )
+        text = ", ".join(f"{seconds:.2f} s {why}" for seconds, why in parts if seconds)
+        without = (
+            f"; no valid reading for {text}" * bool(text) if row.valid_s else f"; NO VALID READING: {text}"
+        )
+        lines.append(f"{row.recording}: {row.seconds:.1f} s, {n} alarm{'' if n == 1 else 's'}{without}")
         for alarm in row.alarms:
             why = f": {alarm.diagnosis}" if alarm.diagnosis else ""
             of = f" ({', '.join(alarm.channels)})" if alarm.channels else ""
             lines.append(f"  {alarm.start_s:.2f} to {alarm.end_s:.2f} s{of}{why}")
     for what, cuts in (("gap", result.gaps), ("not monitored", result.not_watched)):
-        lines += [f"{what} in {cut.file}: {cut.start:.2f} to {cut.end:.2f} s, {cut.why}" for cut in cuts]
+        lines += [f"{what} in {cut.file}: {cut.start_s:.2f} to {cut.end_s:.2f} s, {cut.why}" for cut in cuts]
     return lines
-
-
-def _invalid(row: RecordingResult) -> str:
-    parts = (
-        (row.warm_up_s, "warm-up"),
-        (row.missing_s, "samples are missing"),
-        (row.not_finite_s, "results of model or estimator are not finite"),
-    )
-    text = ", ".join(f"{seconds:.2f} s {why}" for seconds, why in parts if seconds)
-    if not row.valid_s:
-        return f"; NO VALID READING: {text}"
-    return f"; no valid reading for {text}" if text else ""

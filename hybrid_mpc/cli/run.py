@@ -194,9 +194,9 @@ def comparison_lines(comparisons: Mapping[str, Mapping[str, Comparison]]) -> lis
 def on_model_lines(found: OnModelResult) -> list[str]:
     """Closed-loop costs on models, one line per controller."""
     lines = []
-    for name, cells in found.means.items():
-        words = ", ".join(f"{task} {_cell(cell.cost.mean)}" for task, cell in cells.items())
-        lines.append(f"{name} on the model {found.plants[name]}, not the machine: cost of {words}")
+    for name, plant in found.plants.items():
+        words = ", ".join(f"{task} {_cell(cells[name].cost.mean)}" for task, cells in found.means.items())
+        lines.append(f"{name} on the model {plant}, not the machine: cost of {words}")
     return lines
 
 

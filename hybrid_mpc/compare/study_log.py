@@ -40,7 +40,12 @@ SEGMENT_ROWS = 10_000
 
 @dataclass(frozen=True)
 class NoiseNote:
-    """Process noise of a model's filters: its source, and standard deviations per period by controller."""
+    """Process noise of a model's filters.
+
+    Args:
+        source: Its source.
+        sigma_x: Standard deviations per period by controller.
+    """
 
     source: str
     sigma_x: Mapping[str, tuple[float, ...]]
@@ -48,7 +53,13 @@ class NoiseNote:
 
 @dataclass(frozen=True)
 class ModelNote:
-    """A model of a study: hash of its folder, provenance, and process noise of its filters."""
+    """A model of a study.
+
+    Args:
+        sha256: Hash of its folder.
+        provenance: Its provenance.
+        noise: Process noise of its filters.
+    """
 
     sha256: str
     provenance: Mapping[str, Any]
@@ -57,7 +68,21 @@ class ModelNote:
 
 @dataclass(frozen=True)
 class StudyNote:
-    """Note of a study: ``study`` are its settings as plain data; ``engine`` is empty until the study is finished."""
+    """Note of a study.
+
+    Args:
+        study: Its settings.
+        title: Title of the scenario.
+        description: Description of the scenario.
+        models: Its models by label.
+        runs: Number of its loops.
+        versions: Versions of the packages by name.
+        kind: What its runs are. Default: ``"loops"``.
+        scenario_sha256: Hash of the scenario's file; None for a registered scenario.
+        engine: What computed the runs; empty until the study is finished.
+        workers_died: Number of dead workers.
+        schema_version: Version of the note.
+    """
 
     study: Mapping[str, Any]
     title: str

@@ -85,6 +85,12 @@ class StudyModel:
     kit: Kit
     noise_source: str
 
+    def note(self, controllers: Iterable[str]) -> ModelNote:
+        """Its note, with the noise of the filters of these controllers."""
+        names = {noise_name(c): None for c in controllers if not CONTROLLERS[c].truth}
+        sigma = {name: tuple(self.kit.noise(name).tolist()) for name in names}
+        return ModelNote(self.sha256, plain(self.kit.provenance), NoiseNote(self.noise_source, sigma))
+
 
 def load_models(
     study: Study, held: Mapping[str, NoiseNote] | None = None, *, plant: bool = True
@@ -163,10 +169,9 @@ def load_inputs(
     """Runner of a study's loops, and notes of its models by label; ``held`` are the notes of a resumed study."""
     models, notes = [], {}
     for label, m in load_models(study, {k: note.noise for k, note in (held or {}).items()}).items():
-        names = {noise_name(c): None for c in study.controllers if not CONTROLLERS[c].truth}
-        sigma = {name: tuple(m.kit.noise(name).tolist()) for name in names}
-        models.append(ModelInput(label, str(m.folder.resolve()), m.sha256, tuple(sigma.items())))
-        notes[label] = ModelNote(m.sha256, plain(m.kit.provenance), NoiseNote(m.noise_source, sigma))
+        notes[label] = note = m.note(study.controllers)
+        noise = tuple(note.noise.sigma_x.items())
+        models.append(ModelInput(label, str(m.folder.resolve()), m.sha256, noise))
     return LoopRunner(study.scenario, tuple(models)), notes
 
 
@@ -305,12 +310,12 @@ def make_note(
     return StudyNote(study, scenario.title, scenario.description, models, runs, versions(), kind, content)
 
 
-def job_note(note: StudyNote) -> JobNote:
-    """The note in a study's folder."""
+def job_note(note: StudyNote, noun: str = NOUN) -> JobNote:
+    """The note in the folder of a study, or of another job (``noun``) with its settings."""
     models = {f"the content of model {label}": model.sha256 for label, model in note.models.items()}
     settings = {key: value for key, value in note.study.items() if key != "name"}
     settings |= models | {"the content of the scenario's file": note.scenario_sha256}
-    return JobNote(NOUN, settings, plain(note))
+    return JobNote(noun, settings, plain(note))
 
 
 def held_models(out: Path) -> Mapping[str, ModelNote] | None:

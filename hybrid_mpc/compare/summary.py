@@ -1,16 +1,22 @@
-"""Summaries of closed loops: means with intervals, by task and controller."""
+"""The record of closed loops, with their means and intervals by task and controller, and the durations of steps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hybrid_mpc.compare.loops import LoopRow
+from hybrid_mpc.compare.loops import LoopRow, with_arrays
 from hybrid_mpc.compare.sequential import LEVEL, level_at
 from hybrid_mpc.control.safeguard import Source
+from hybrid_mpc.loop.realtime import percentiles
+from hybrid_mpc.records import beside
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -119,3 +125,71 @@ def summary(rows: Sequence[LoopRow], level: float = LEVEL) -> Summary:
         sources={s.name: float(np.mean([row.sources[s.name] for row in rows])) for s in Source},
         limits=limits,
     )
+
+
+@dataclass(frozen=True)
+class ClosedLoops:
+    """A record of closed loops.
+
+    Args:
+        rows: The loops by task, controller and seed.
+        arrays: Their kept signals, ``"NUMBER/NAME"`` with the number of the row.
+    """
+
+    rows: tuple[LoopRow, ...]
+    _: KW_ONLY
+    arrays: Mapping[str, Array] = beside()
+
+    @property
+    def kept(self) -> list[LoopRow]:
+        """The loops with their kept signals; most keep none."""
+        return with_arrays(self.rows, self.arrays) if self.rows else []
+
+    @property
+    def drawn(self) -> list[LoopRow]:
+        """The loops that kept signals, with these."""
+        return [row for row in self.kept if row.arrays]
+
+    @cached_property
+    def means(self) -> dict[str, dict[str, Summary]]:
+        """Means of the loops by task and controller."""
+        return summaries(self.rows)
+
+    @property
+    def plants(self) -> dict[str, str]:
+        """Name of the model in place of the machine by controller; empty for loops on the scenario's plant.
+
+        Each controller has another model as plant, so figures of two controllers must not be compared.
+        """
+        return {row.controller: row.on_model for row in self.rows if row.on_model}
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """Durations of a controller's whole steps, from measurement to input [ms of wall time].
+
+    Args:
+        median: Median.
+        p95: 95th percentile.
+        p99: 99th percentile.
+        max: Longest duration.
+        period: Control period.
+        misses: Number of steps that took longer than the period.
+    """
+
+    median: float
+    p95: float
+    p99: float
+    max: float
+    period: float
+    misses: int
+
+
+def step_times(durations: Array, period: float) -> StepTimes:
+    """Statistics of the durations of steps [ms] for a control period [ms].
+
+    Example:
+        >>> step_times(np.array([1.0, 2.0, 3.0]), 2.5).misses
+        1
+    """
+    return StepTimes(**percentiles(durations), period=period, misses=int((durations > period).sum()))

@@ -854,3 +854,10 @@ class SplitController(Controller):
     ) -> Solution:  # fmt: skip
         """The remaining part, with the result of :meth:`prepare`."""
         raise NotImplementedError
+
+    def solve(
+        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
+        *, limits: Limits | None = None, w: Array | None = None,
+    ) -> Solution:  # fmt: skip
+        """:meth:`prepare` and :meth:`finish`."""
+        return self.finish(self.prepare(previous, weight), estimate, reference, limits, w)

@@ -302,13 +302,6 @@ class CondensedController(SplitController):
             steady=target.steady, active=answer.active, given_way=given_way,
         )  # fmt: skip
 
-    def solve(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None, w: Array | None = None,
-    ) -> Solution:  # fmt: skip
-        """:meth:`prepare` and :meth:`finish`."""
-        return self.finish(self.prepare(previous, weight), estimate, reference, limits, w)
-
     def finish(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
         w: Array | None = None,

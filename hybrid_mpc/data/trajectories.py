@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,12 +70,20 @@ class Trajectory(Samples):
         return replace(self, name=name, role=role, **arrays)
 
 
-class Cut(NamedTuple):
-    """A part of a recording that is left out: file name, start and end [s], and the reason."""
+@dataclass(frozen=True)
+class Cut:
+    """A part of a recording that is cut out or interpolated.
+
+    Args:
+        file: Name of the recording.
+        start_s: Start [s] in the recording's own time: the last sample before it.
+        end_s: End [s]: the first sample after it.
+        why: Its reason.
+    """
 
     file: str
-    start: float
-    end: float
+    start_s: float
+    end_s: float
     why: str
 
 
@@ -458,7 +465,7 @@ def _check_roles(
     missing = [role for role in needed if all(piece.role != role for piece in trajectories)]
     if not missing:
         return
-    dropped = "".join(f"\n  {cut.file} {cut.start:g} to {cut.end:g} s: {cut.why}" for cut in cuts[:SHOWN])
+    dropped = "".join(f"\n  {cut.file} {cut.start_s:g} to {cut.end_s:g} s: {cut.why}" for cut in cuts[:SHOWN])
     dropped += f"\n  and {len(cuts) - SHOWN} more" if len(cuts) > SHOWN else ""
     used = [fraction for fraction in spec.fractions if fraction > 0]
     distances = [0.0, *(spec.smoothing for _ in used[1:])]

@@ -151,13 +151,6 @@ class NativeController(SplitController):
             given_way=self._given_way(),
         )
 
-    def solve(
-        self, previous: Solution, estimate: Estimate, reference: Array, weight: Array | None = None,
-        *, limits: Limits | None = None, w: Array | None = None,
-    ) -> Solution:  # fmt: skip
-        """Call :meth:`prepare`, then :meth:`finish`."""
-        return self.finish(self.prepare(previous, weight), estimate, reference, limits, w)
-
     def _load(self, plan: Solution) -> None:
         m = self.model
         z = np.hstack([plan.x, plan.h])

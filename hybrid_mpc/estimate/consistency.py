@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import Recording, measured_disturbances
+from hybrid_mpc.records import BESIDE
 
 Array = NDArray[np.float64]
 LEVEL = 0.95
@@ -40,20 +41,28 @@ class Consistency:
     """Two tests of a filter's innovations, each passed by 95 % of the consistent filters.
 
     If the mean NIS is above its band, the filter assumes too little noise (or its model is wrong); below, too much.
-    ``nis_inside`` is the share of single NIS below their 95 % quantile. ``autocorrelation`` ``(lags, n_y)`` are those
-    of the normalised innovations at lags 1, 2, ..., with half the width of the 95 % band of one; the Ljung-Box
-    statistic is summed over the outputs, with its 95 % quantile. Both bands are for white innovations.
+
+    Args:
+        mean_nis: Mean normalised innovation squared; the number of outputs if the covariances are right.
+        nis_band: Its 95 % band.
+        nis_inside: Share of single NIS below their 95 % quantile.
+        ljung_box: Ljung-Box statistic of the autocorrelations, summed over the outputs.
+        ljung_box_limit: Its 95 % quantile for white innovations.
+        samples: Number of samples.
+        correlation_band: Half the width of the 95 % band of one autocorrelation for white innovations.
+        autocorrelation: Autocorrelations ``(lags, n_y)`` of the normalised innovations at lags 1, 2, ...
+        runs: Innovations of each recording.
     """
 
-    runs: tuple[Innovations, ...]
-    samples: int
     mean_nis: float
     nis_band: tuple[float, float]
     nis_inside: float
-    autocorrelation: Array
-    correlation_band: float
     ljung_box: float
     ljung_box_limit: float
+    samples: int
+    correlation_band: float
+    autocorrelation: Array = field(default_factory=lambda: np.zeros(0), compare=False, metadata=BESIDE)
+    runs: tuple[Innovations, ...] = field(default=(), compare=False, metadata=BESIDE)
 
 
 def consistency(

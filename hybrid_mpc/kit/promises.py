@@ -54,15 +54,15 @@ class Promise:
 
 @dataclass(frozen=True)
 class PromiseTable:
-    """Content of ``promises.json``.
+    """The table "What this kit promises", content of ``promises.json``.
 
     Args:
-        of: Digest of the models and loop settings that the table belongs to.
         rows: The promises, in the order of the table.
+        of: Digest of the models and loop settings that the table belongs to.
     """
 
-    of: Line
     rows: tuple[Promise, ...]
+    of: Line
 
 
 def write_promises(folder: Path, table: PromiseTable) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ from hybrid_mpc.plots.style import (
 )
 from hybrid_mpc.rules import counted
 
+CHANNEL = "_from_"
+"""Separates a figure's name from its channel, if there are several channels."""
 _MARKERS = {"phy": "x", "prior": "x", "mopgrnn": "o", "hybrid": "o", "oracle": "s"}
 _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)
 _COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
@@ -147,6 +150,30 @@ def _z_grid(ax: Axes, dt: float, spacing: float, reach: float) -> None:
         z = np.exp(turn * np.exp(1j * damping_angle))
         for side in (z, z.conj()):
             ax.plot(side.real, side.imag, color="#dedede", linewidth=0.7, zorder=1)
+
+
+def channel_words(inputs: Sequence[Signal], outputs: Sequence[Signal], i: int, j: int) -> tuple[str, str]:
+    """Parts of a figure's name and caption that name output ``i`` and input ``j``; empty for a single channel."""
+    if len(inputs) * len(outputs) == 1:
+        return "", ""
+    ends = f"{inputs[j].name}_to_{outputs[i].name}", f"{inputs[j].name} to {outputs[i].name}"
+    return f"{CHANNEL}{ends[0]}", f", from {ends[1]}"
+
+
+def bodes(
+    responses: Mapping[str, tuple[Array, Array, Array]],
+    inputs: Sequence[Signal],
+    outputs: Sequence[Signal],
+    dt: float,
+) -> Iterator[tuple[str, str, Figure]]:
+    """:func:`bode` of every channel, with the :func:`channel_words` before it.
+
+    ``responses`` are frequencies ``(n,)``, magnitudes and phases ``(n_y, n_u, n)``, by model.
+    """
+    for i, j in product(range(len(outputs)), range(len(inputs))):
+        own = {name: (omega, size[i, j], phase[i, j]) for name, (omega, size, phase) in responses.items()}
+        figure = bode(own, input_signal=inputs[j], output_signal=outputs[i], nyquist=np.pi / dt)
+        yield *channel_words(inputs, outputs, i, j), figure
 
 
 def bode(

@@ -21,14 +21,42 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm: first and last sample [s] in the recording's time, diagnosis (empty if unknown), and channels in the
-    order of their alarms.
+    """An alarm.
+
+    Args:
+        start_s: First sample [s] in the recording's own time.
+        end_s: Last sample [s].
+        diagnosis: Its cause; empty without a diagnosis.
+        channels: Channels in the order of their alarms.
     """
 
     start_s: float
     end_s: float
     diagnosis: str
     channels: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class WatchedRecording:
+    """A recording that was monitored.
+
+    Args:
+        recording: Its name.
+        seconds: Its length [s].
+        valid_s: Time with a valid reading [s].
+        warm_up_s: Time until all windows were full [s].
+        missing_s: Time with missing samples [s].
+        not_finite_s: Time with a non-finite value of model or estimator [s].
+        alarms: Its alarms.
+    """
+
+    recording: str
+    seconds: float
+    valid_s: float
+    warm_up_s: float
+    missing_s: float
+    not_finite_s: float
+    alarms: tuple[Alarm, ...]
 
 
 def explained(

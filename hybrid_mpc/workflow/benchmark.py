@@ -43,7 +43,7 @@ from hybrid_mpc.workflow.benchmark_runs import (
 )
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.settings import RunSettings
-from hybrid_mpc.workflow.stage import Stage, bring_up_to_date
+from hybrid_mpc.workflow.stage import Stage, bring_up_to_date, read_as
 from hybrid_mpc.workflow.stages.choose import CANDIDATES, CHOICE, ChoiceResult, choice_stage
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, TASKS
 from hybrid_mpc.workflow.stages.identify import (
@@ -58,7 +58,6 @@ from hybrid_mpc.workflow.stages.identify import (
     stops,
     trained_models,
 )
-from hybrid_mpc.workflow.stages.results import read_as
 
 Array = NDArray[np.float64]
 NOUN = "benchmark"

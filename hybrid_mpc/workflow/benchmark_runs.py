@@ -83,7 +83,7 @@ def read_training(scenario: Scenario, paths: Sequence[Path]) -> Recordings:
         tuple(p for p in parts if p.role == role) for role in ("train", "valid", "test")
     )
     if not (train and valid):
-        cut = "".join(f"\n  {c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in dataset.cuts)
+        cut = "".join(f"\n  {c.file} {c.start_s:g} to {c.end_s:g} s: {c.why}" for c in dataset.cuts)
         raise InputError(
             f"recordings: no data remain to {'validate on' if train else 'train on'}; give longer recordings"
             f"{f'. Cut out:{cut}' if cut else ''} [HM-WORKFLOW-047]"

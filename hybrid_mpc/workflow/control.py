@@ -1,4 +1,4 @@
-"""``hybrid-mpc control``: closed loops of a model, their results.json (docs/control-results.md) and figures."""
+"""``hybrid-mpc control``: closed loops of a model, their results.json and figures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.compare.controllers import CONTROLLERS, noise_name
 from hybrid_mpc.compare.loops import (
     DRAWN,
     ON_MODEL,
@@ -22,69 +21,41 @@ from hybrid_mpc.compare.loops import (
     write_rows,
 )
 from hybrid_mpc.compare.study import Study
-from hybrid_mpc.compare.study_log import NoiseNote
-from hybrid_mpc.compare.study_run import StudyModel, load_models
-from hybrid_mpc.compare.summary import Summary, by_task, summaries
+from hybrid_mpc.compare.study_log import StudyNote
+from hybrid_mpc.compare.study_run import StudyModel, job_note, load_models, make_note
+from hybrid_mpc.compare.summary import ClosedLoops, StepTimes, by_task, step_times
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.files import digest, write_json
-from hybrid_mpc.folder import JobNote, check_out, open_folder, versions
-from hybrid_mpc.kit.parts import Provenance
+from hybrid_mpc.folder import check_out, open_folder
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.faults import fault_text
-from hybrid_mpc.loop.realtime import percentiles
 from hybrid_mpc.records import plain
 from hybrid_mpc.scenario import load_scenario
-from hybrid_mpc.watch.detector import WatchLimits
-from hybrid_mpc.workflow.stage import sources
+from hybrid_mpc.workflow.stage import read_as, sources
 
 Array = NDArray[np.float64]
 NOUN = "control"
-SCHEMA_VERSION = 6
-
-
-@dataclass(frozen=True)
-class FaultNote:
-    """A fault in all loops; ``channel`` is empty if there is only one channel."""
-
-    target: str
-    value: float
-    channel: str
-    start_s: float
-    end_s: float
+SCHEMA_VERSION = 7
 
 
 @dataclass(frozen=True)
 class ControlResults:
-    """Content of ``results.json`` of ``hybrid-mpc control`` (docs/control-results.md): settings, every loop, and means.
+    """``results.json`` of ``hybrid-mpc control``.
 
-    ``guard`` are the limits of the monitor that triggers the guard, ``reaction`` is the guard's reaction; ``step_ms``
-    are percentiles of step durations by controller, ``summary`` is by task and controller. For a scenario without plant
-    ``on_model`` names the model that replaces the machine, by controller: then the figures say nothing about the
-    machine, and controllers must not be compared, since their plants differ. ``promises`` are those of the model's
-    folder.
+    Args:
+        schema_version: Version of the file.
+        note: Settings, model, noise of its observers, and versions, as the note of a study has them.
+        step_ms: Durations of steps by controller.
+        promises: What the kit promises.
+        loops: Every loop. In Python: ``loops.means``, ``loops.plants``.
     """
 
-    schema: str
     schema_version: int
-    scenario: str
-    solver: str
-    controllers: tuple[str, ...]
-    tasks: tuple[str, ...]
-    seeds: int
-    seed: int
-    faults: tuple[FaultNote, ...]
-    guard: WatchLimits | None
-    reaction: str
-    model: Mapping[str, Provenance]
-    noise: NoiseNote
-    versions: Mapping[str, str]
-    period_ms: float
-    step_ms: Mapping[str, Mapping[str, float]]
-    on_model: Mapping[str, str]
-    summary: Mapping[str, Mapping[str, Summary]]
-    loops: tuple[LoopRow, ...]
+    note: StudyNote
+    step_ms: Mapping[str, StepTimes]
     promises: tuple[Promise, ...]
+    loops: ClosedLoops
 
 
 def run_control(
@@ -102,12 +73,14 @@ def run_control(
     (model,) = load_models(study, plant=False).values()
     bench = Bench(load_scenario(study.scenario), dict.fromkeys(study.folders, model.kit))
     progress.finish(model.noise_source)
-    settings = {key: value for key, value in study.identity().items() if key != "name"}
-    note = JobNote(NOUN, settings | {"the content of the model": model.sha256})
-    with open_folder(out, note, resume=resume):
+    models = dict.fromkeys(study.folders, model.note(study.controllers))
+    note = make_note(study.identity(), models, study.size)
+    with open_folder(out, job_note(note, NOUN), resume=resume):
         progress.start("closing the loop")
         rows = _rows(bench, study, model, out / "loops", progress)
-        results = collected(study, bench, model, rows)
+        period = 1e3 * model.kit.models["prior"].dt
+        times = {name: step_times(values, period) for name, values in _times(rows).items()}
+        results = ControlResults(SCHEMA_VERSION, note, times, model.kit.promises, ClosedLoops(tuple(rows)))
         write_json(out / "results.json", plain(results))
         progress.finish("")
         progress.start("drawing")
@@ -138,33 +111,16 @@ def _digest(spec: LoopSpec, model: StudyModel) -> str:
     return digest([spec.id, spec.keep, model.sha256, sources(__name__)])
 
 
-def collected(study: Study, bench: Bench, model: StudyModel, rows: Sequence[LoopRow]) -> ControlResults:
-    """Results of finished loops."""
-    kit = bench.kits[next(iter(study.folders))]
-    (faults,) = study.fault_sets
-    filters = dict.fromkeys(noise_name(name) for name in study.controllers if not CONTROLLERS[name].truth)
-    return ControlResults(
-        schema="hybrid-mpc control",
-        schema_version=SCHEMA_VERSION,
-        scenario=bench.scenario.name,
-        solver=study.solvers[0],
-        controllers=tuple(study.controllers),
-        tasks=tuple(dict.fromkeys(row.task for row in rows)),
-        seeds=len(study.loop_seeds),
-        seed=study.run_seed,
-        faults=tuple(FaultNote(f.target, f.value, f.channel, f.start, f.end) for f in faults),
-        guard=kit.limits("hybrid") if study.guard else None,
-        reaction=study.guard,
-        model={"provenance": kit.provenance},
-        noise=NoiseNote(model.noise_source, {name: tuple(kit.noise(name).tolist()) for name in filters}),
-        versions=versions(),
-        period_ms=1e3 * kit.models["prior"].dt,
-        step_ms={name: percentiles(values) for name, values in _times(rows).items()},
-        on_model={row.controller: row.on_model for row in rows if row.on_model},
-        summary=summaries(rows),
-        loops=tuple(rows),
-        promises=kit.promises,
-    )
+def read_control(path: Path) -> ControlResults:
+    """Read a ``results.json`` of ``hybrid-mpc control``, checked; arrays are empty.
+
+    Raises:
+        InputError: If the file is missing, damaged, or of another version.
+
+    Example:
+        ``read_control(Path("strokes/results.json")).loops.means["stroke_4"]["hybrid_observer"].cost``
+    """
+    return read_as(ControlResults, SCHEMA_VERSION, path, "hybrid-mpc control")
 
 
 def _times(rows: Sequence[LoopRow]) -> dict[str, Array]:
@@ -189,7 +145,7 @@ def figures(
         progress.update("figures", i, len(drawn), task.name)
         first = {name: found[0].arrays for name, found in drawn[task.name].items()}
         control = kit.problem(task.name)
-        stands = {row.controller: row.on_model for row in rows if row.on_model}
+        stands = ClosedLoops(tuple(rows)).plants
         if stands:  # each controller met another plant: no picture compares them
             for name, arrays in first.items():
                 title = f"{task.title}, {name}, {ON_MODEL} ({stands[name]})"

@@ -19,7 +19,7 @@ from hybrid_mpc.model.model import HybridModel
 from hybrid_mpc.records import record
 from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.watch.detector import WatchLimits
-from hybrid_mpc.watch.explain import Alarm, explained, table
+from hybrid_mpc.watch.explain import WatchedRecording, explained, table
 from hybrid_mpc.watch.learn import learn_limits
 from hybrid_mpc.watch.lengths import rest_speeds
 from hybrid_mpc.watch.monitor import Monitor, make_monitor, make_readings, reads_energy
@@ -28,27 +28,28 @@ from hybrid_mpc.watch.replay import EstimatorLike, along
 
 
 @dataclass(frozen=True)
-class RecordingResult:
-    """Alarms on a recording, and the time [s] without valid readings: the window was not full (``warm_up_s``), samples
-    were missing, or model or estimator gave a non-finite value.
+class MonitorResult:
+    """Results of :func:`watch`, content of ``monitor.json``.
+
+    Args:
+        kind: Kind of readings.
+        recordings: The recordings with their alarms.
+        warnings: Warnings about the recordings.
+        notes: How files were read that needed more than a plain table.
+        gaps: Gaps of the recordings.
+        not_watched: Parts too short for the monitor.
+        limits: Limits of the channels.
+        data_hash: Hash of the recordings.
     """
 
-    recording: str
-    seconds: float
-    valid_s: float
-    warm_up_s: float
-    missing_s: float
-    not_finite_s: float
-    alarms: tuple[Alarm, ...]
-
-
-@dataclass(frozen=True)
-class MonitorResult:
-    """Results of :func:`watch` for each recording, gaps of the recordings, and parts too short for the monitor."""
-
-    recordings: tuple[RecordingResult, ...]
+    kind: str
+    recordings: tuple[WatchedRecording, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
     gaps: tuple[Cut, ...]
     not_watched: tuple[Cut, ...]
+    limits: WatchLimits | None
+    data_hash: str
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def prepared(
     spec = replace(spec, windows={}, warm_up=spec.dt, fractions=(1.0, 0.0, 0.0))
     data = load_trajectories(recordings, watched, spec, needed=())
     if not data.whole:
-        cut = "; ".join(f"{c.file} {c.start:g} to {c.end:g} s: {c.why}" for c in data.cuts)
+        cut = "; ".join(f"{c.file} {c.start_s:g} to {c.end_s:g} s: {c.why}" for c in data.cuts)
         raise InputError(
             f"recordings: every part is too short for the monitor: {cut}. Give longer recordings [HM-WORKFLOW-025]"
         )
@@ -191,7 +192,7 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
     for recording, report in along(job.data.whole, progress.update):
         name, seconds = recording.name.replace("#", "_"), len(recording.t) * recording.dt
         trace, alarms = explained(monitor, job.estimator, recording, diagnoser, report)
-        rows.append(RecordingResult(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
+        rows.append(WatchedRecording(recording.name, seconds, **trace.coverage(recording.dt), alarms=alarms))
         write_text(out / f"{name}.csv", table(trace, recording.y, job.model.outputs, monitor))
         notes = [(alarm.start_s, alarm.diagnosis) for alarm in alarms if alarm.diagnosis]
         figure = channels(
@@ -199,16 +200,10 @@ def watch(job: MonitorJob, out: Path, progress: Progress | None = None) -> Monit
         )
         save(figure, out / f"{name}.png")
     progress.finish("")
-    gaps, short = ([cut for cut in job.data.cuts if ("gap" in cut.why) is gap] for gap in (True, False))
-    result = {
-        "kind": job.kind,
-        "recordings": rows,
-        "warnings": job.data.warnings,
-        "notes": job.data.notes,
-        "gaps": [cut._asdict() for cut in gaps],
-        "not_watched": [cut._asdict() for cut in short],
-        "limits": job.limits,
-        "data_hash": job.data.hash,
-    }
+    data = job.data
+    gaps, short = (tuple(cut for cut in data.cuts if ("gap" in cut.why) is gap) for gap in (True, False))
+    result = MonitorResult(
+        job.kind, tuple(rows), data.warnings, data.notes, gaps, short, job.limits, data.hash
+    )
     write_json(out / "monitor.json", result)
-    return MonitorResult(tuple(rows), tuple(gaps), tuple(short))
+    return result

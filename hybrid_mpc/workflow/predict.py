@@ -53,7 +53,7 @@ def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory
         long = [t for t in data.whole if len(t.t) * spec.dt > least - 0.5 * spec.dt]
         if not long:
             parts = [t.t[-1] - t.t[0] + spec.dt for t in data.whole]
-            parts += [c.end - c.start for c in data.cuts if not c.why.startswith("gap")]
+            parts += [c.end_s - c.start_s for c in data.cuts if not c.why.startswith("gap")]
             problems.append(
                 f"{path}: too short. Its longest part without a gap has {max(parts, default=0.0):.4g} s; the warm-up "
                 f"of {spec.warm_up:g} s and {MIN_SCORED} periods need {least:.4g} s. Give a longer recording "

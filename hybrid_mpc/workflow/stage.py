@@ -23,7 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.errors import InputError, StorageError, no_exit
-from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document, write_text
+from hybrid_mpc.files import (
+    digest,
+    read_document,
+    read_document_arrays,
+    read_object,
+    write_document,
+    write_text,
+)
 from hybrid_mpc.records import plain, record
 
 if TYPE_CHECKING:
@@ -211,6 +218,21 @@ def _unfit(error: InputError) -> Stored[Any]:
 
 def _has_arrays(stage: Stage[Any]) -> bool:
     return any(f.name == "arrays" for f in fields(stage.result))
+
+
+def read_as(kind: type[R], version: int, path: Path, command: str) -> R:
+    """Read a ``results.json`` of this kind and version; ``command`` writes it.
+
+    Raises:
+        InputError: If the file is missing, damaged, or of another version.
+    """
+    document = read_object(path)
+    if (found := document.get("schema_version")) != version:
+        raise InputError(
+            f"{path}: schema_version is {str(found)[:20]}, but this version reads {version}. Write the file again: "
+            f"repeat the command of {command} (of a run with --resume) [HM-WORKFLOW-040]"
+        )
+    return record(kind, document, str(path))
 
 
 def differing(before: Mapping[str, str], now: Mapping[str, str]) -> str:

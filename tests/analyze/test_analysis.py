@@ -1,5 +1,7 @@
 """Linear analysis against closed forms and python-control."""
 
+import json
+
 import casadi as ca
 import control
 import numpy as np
@@ -8,9 +10,18 @@ from analyze_parts import response, system
 from online_models import rk4
 from scipy.linalg import expm
 
-from hybrid_mpc import HybridModel, InputError, Signal, frequency_response, linearize, linearize_at_speed
+from hybrid_mpc import (
+    HybridModel,
+    InputError,
+    Signal,
+    frequency_response,
+    linearize,
+    linearize_at_speed,
+    system_structure,
+)
+from hybrid_mpc.analyze.properties import Mode, modes, stabilisable_detectable
 from hybrid_mpc.model.equilibrium import fixed_point
-from hybrid_mpc.workflow.stages.analyze import linear_point
+from hybrid_mpc.records import plain, record
 
 DT, J, MGL, GAMMA = 0.02, 0.1, 1.5, 0.15
 
@@ -72,22 +83,20 @@ def test_linearisation_is_the_matrix_exponential(phi):
 
 
 def test_poles_frequency_and_damping_are_those_of_the_pendulum():
-    result = linear_point(linearize(machine(), [0.0, 0.0], [0.0]))
+    result = system_structure(linearize(machine(), [0.0, 0.0], [0.0]))
     omega, zeta = np.sqrt(MGL / J), GAMMA / (2 * np.sqrt(MGL * J))
-    assert np.abs(np.array(result.frequency_rad_s) - omega).max() < 1e-6  # RK4's 1e-9 over dt
-    assert np.abs(np.array(result.damping) - zeta).max() < 1e-6
-    assert result.stable
-    assert all(result.slow)  # 3.9 rad/s against a tenth of Nyquist, 15.7 rad/s
-    upright = linear_point(linearize(machine(), [np.pi, 0.0], [0.0]))
-    assert not upright.stable
+    assert np.abs(np.array([m.frequency for m in result.modes]) - omega).max() < 1e-6  # RK4's 1e-9 over dt
+    assert np.abs(np.array([m.damping for m in result.modes]) - zeta).max() < 1e-6
+    assert np.abs(result.poles).max() < 1.0
+    upright = system_structure(linearize(machine(), [np.pi, 0.0], [0.0]))
     assert upright.stabilisable
     assert upright.detectable
-    assert upright.poles[0][0] > 1.0
+    assert upright.poles[0].real > 1.0
 
 
 def test_agrees_with_python_control():
     sys = linearize(machine(n_h=1), [0.1, 0.5], [0.0])
-    mine = np.sort_complex([complex(*pole) for pole in linear_point(sys).poles])
+    mine = np.sort_complex(system_structure(sys).poles)
     assert np.abs(mine - np.sort_complex(control.poles(sys))).max() < 1e-12  # the same matrix
     omega = np.geomspace(0.1, 100.0, 30)
     theirs = control.frequency_response(sys, omega)
@@ -125,19 +134,22 @@ def test_working_speed_frees_the_linearisation_of_the_friction_at_rest():
 )
 def test_hautus_on_textbook_systems(a, b, c, reach, see):
     sys = system(a, b, c)
-    found = linear_point(sys)
-    assert (found.stabilisable, found.detectable) == (reach, see)
+    assert stabilisable_detectable(modes(sys)) == (reach, see)
 
 
-def test_slow_and_fast_poles_are_told_apart():
-    result = linear_point(system(np.diag([0.99, 0.0, 0.1]), np.ones((3, 1)), np.ones((1, 3))))
-    assert result.slow == (True, False, False)
-    assert result.frequency_rad_s[2] is None
+def test_modes_are_written_and_read_back():
+    found = modes(system(np.diag([0.99, 0.0, 0.1]), np.ones((3, 1)), np.ones((1, 3))))
+    assert found[2].frequency == np.inf  # of the pole at zero
+    turning = modes(system([[0.5, 0.4], [-0.4, 0.5]], np.ones((2, 1)), np.ones((1, 2))))
+    for one in (*found, *turning):
+        assert record(Mode, json.loads(json.dumps(plain(one))), "a mode") == one
+    with pytest.raises(InputError, match=r"pole: a real and an imaginary part.*HM-RECORDS-006"):
+        record(Mode, plain(found[0]) | {"pole": [1.0]}, "a mode")
 
 
 def test_bad_input_speaks():
     with pytest.raises(InputError, match="HM-ANALYZE-010"):
-        linear_point(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
+        modes(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
     with pytest.raises(InputError, match="HM-ANALYZE-050"):
         frequency_response(system([[0.5]], [[1.0]], [[1.0]]), [100.0])
     with pytest.raises(InputError, match="HM-MODEL-017"):

@@ -39,6 +39,7 @@ from hybrid_mpc.analyze.page import _draw_measured, tables_of, write_analysis
 from hybrid_mpc.cli.analyze import command
 from hybrid_mpc.cli.main import app
 from hybrid_mpc.kit.parts import loop_settings, read_description, save_loop, write_description
+from hybrid_mpc.records import plain
 from hybrid_mpc.workflow.analyze import AnalysisSettings, _speed, analysis_input
 from nn_export import load_programs
 from scenarios.golf_robot import scenario
@@ -77,16 +78,19 @@ def test_an_analysis_without_a_control_problem_says_what_it_leaves_out(prior_alo
         rows = [r for r in csv.DictReader(file) if r["point"] == "rest"]
     written = [complex(float(r["pole, real [-]"]), float(r["pole, imaginary [-]"])) for r in rows]
     at_rest = result.linear["prior"]["rest"]
-    assert np.array_equal(written, at_rest.poles)  # all digits
+    assert np.array_equal(written, at_rest.structure.poles)  # all digits
     z = np.exp(1j * at_rest.response.omega * 0.02)[:, None]
-    product = np.prod(np.abs(z - at_rest.zeros), axis=1) / np.prod(np.abs(z - at_rest.poles), axis=1)
+    product = np.prod(np.abs(z - at_rest.zeros), axis=1) / np.prod(
+        np.abs(z - at_rest.structure.poles), axis=1
+    )
     # Poles and zeros are the response but for a factor; near the Nyquist frequency it is 1e-3 of the largest.
     factor = at_rest.response.magnitude[0, 0] / product
     assert np.ptp(factor) < 1e-9 * np.max(factor)
     numbers = json.loads((tmp_path / "analysis.json").read_text())
     assert numbers["equilibria"]["prior"]["points"][0]["stability"] == "stable"
+    assert numbers["linear"]["prior"]["rest"]["structure"]["modes"] == plain(at_rest.structure.modes)
     with np.load(tmp_path / "curves.npz") as curves:
-        assert np.array_equal(curves["linear/prior/rest/poles"], at_rest.poles)
+        assert np.array_equal(curves["linear/prior/rest/zeros"], at_rest.zeros)
     for picture in (tmp_path / "figures").glob("*.png"):
         with Image.open(picture) as image:
             assert min(image.size) > 300

@@ -389,7 +389,7 @@ def test_a_kit_reads_its_table_and_says_where_it_does_not_fit(artifact):
     old = load(artifact)
     assert [row.verdict for row in old.promises] == ["not promised"]
     assert "contains no table" in old.promises[0].evidence
-    write_promises(artifact, PromiseTable(old.identity, (ROW,)))
+    write_promises(artifact, PromiseTable((ROW,), old.identity))
     kit = load(artifact)
     assert kit.promises == (ROW,)
     other = kit.with_noise({"hybrid_observer": (1e-3, 2e-2)})
@@ -408,7 +408,7 @@ def test_a_kit_reads_its_table_and_says_where_it_does_not_fit(artifact):
     ids=["by hand", "cut", "version"],
 )
 def test_a_damaged_table_is_refused(artifact, change):
-    write_promises(artifact, PromiseTable("x", (ROW,)))
+    write_promises(artifact, PromiseTable((ROW,), "x"))
     path = artifact / PROMISES
     path.write_text(change(path.read_text()))
     with pytest.raises(InputError, match=PROMISES):

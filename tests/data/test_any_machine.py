@@ -75,7 +75,7 @@ def test_a_slow_sensor_of_a_disturbance_is_bridged_and_what_it_does_not_cover_is
     data = read(wrote(tmp_path, wind=slow), WINDY, disturbances=(W,))
     (whole,) = data.whole
     assert (whole.t[0], whole.t[-1]) == pytest.approx((0.5, 5.48))
-    ends = [(cut.start, cut.end) for cut in data.cuts if "not covered" in cut.why]
+    ends = [(cut.start_s, cut.end_s) for cut in data.cuts if "not covered" in cut.why]
     assert ends == [pytest.approx((0.0, 0.5)), pytest.approx((5.5, 5.99))]
     lines = np.interp(whole.t + 0.01, T[50::100], slow[50::100])
     np.testing.assert_allclose(whole.w[:, 0], lines, atol=1e-9)  # no kink within a period
@@ -325,7 +325,7 @@ def test_known_delays_bring_columns_together(tmp_path):
     np.testing.assert_allclose(whole.u[:, 0], mean, atol=0.005 * 3.5)
     assert whole.t[0] == pytest.approx(3.013)  # inputs are known from then on
     assert t[-1] - 0.137 - 0.02 <= whole.t[-1] + whole.dt <= t[-1] - 0.137 + 1e-9  # outputs until then
-    ends = [(cut.start, cut.end) for cut in data.cuts if "not covered" in cut.why]
+    ends = [(cut.start_s, cut.end_s) for cut in data.cuts if "not covered" in cut.why]
     assert ends == [pytest.approx((3.0, 3.013)), pytest.approx((t[-1] - 0.137, t[-1]))]
 
 

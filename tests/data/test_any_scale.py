@@ -83,7 +83,7 @@ def test_time_in_other_units(k, seed, kind, split, start):
     two = read({**columns, "t": k * columns["t"]}, in_time(spec, k), states)
     assert len(one.cuts) == len(two.cuts)
     for a, b in zip(one.cuts, two.cuts, strict=True):
-        np.testing.assert_allclose((b.start / k, b.end / k), (a.start, a.end), atol=1e-9)
+        np.testing.assert_allclose((b.start_s / k, b.end_s / k), (a.start_s, a.end_s), atol=1e-9)
     assert [(f.kind, f.channel, f.count) for f in one.findings] == [
         (f.kind, f.channel, f.count) for f in two.findings
     ]

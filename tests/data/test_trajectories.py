@@ -46,7 +46,7 @@ def test_gap_cuts_and_nothing_leaks_across_it(tmp_path):
     np.testing.assert_array_equal(before.whole[0].x, after.whole[0].x)
     assert before.hash != after.hash
     (cut,) = [cut for cut in before.cuts if "gap" in cut.why]
-    assert (cut.file, cut.start, cut.end) == ("a.csv", 2.99, 3.2)
+    assert (cut.file, cut.start_s, cut.end_s) == ("a.csv", 2.99, 3.2)
 
 
 def test_windows_give_disjoint_roles_and_short_ones_are_reported(tmp_path):
@@ -55,7 +55,7 @@ def test_windows_give_disjoint_roles_and_short_ones_are_reported(tmp_path):
     data = load_trajectories([record(tmp_path / "a.csv", np.arange(0, 6.01, 0.01))], SIGNALS, spec)
     times = np.concatenate([piece.t for piece in data.trajectories])
     assert len(np.unique(times)) == len(times)
-    assert [cut.start for cut in data.cuts] == pytest.approx([2.2])
+    assert [cut.start_s for cut in data.cuts] == pytest.approx([2.2])
     for piece, window in zip(data.trajectories, (windows[0], *windows[2:]), strict=True):
         assert piece.role == window.role
         assert piece.t[0] >= window.start - 1e-6

@@ -149,7 +149,8 @@ def test_a_factor_multiplies_its_term_alone(make):
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
-        (-0.9, "sign"), (57.0, "rad instead of deg"), (0.0175, "deg instead of rad"), (1010.0, "1e3"), (0.5, "twice"), (61.0, "60"),
+        (-0.9, "sign"), (57.0, "rad instead of deg"), (0.0175, "deg instead of rad"), (1010.0, "1e3"),
+        (0.5, "twice"), (61.0, "60"),
         (-4.0, "sign"), (7.9, "unit"), (1.3, ""), (0.7, ""),
     ],
 )  # fmt: skip

@@ -82,12 +82,6 @@ def test_another_version_is_refused_with_what_to_do(changed, version):
         changed("schema_version", version)
 
 
-def test_an_alarm_that_ends_before_it_starts_is_refused(changed):
-    wrong = [{"file": "a.csv", "start_s": 2.0, "end_s": 1.0}]
-    with pytest.raises(InputError, match="HM-WORKFLOW-043"):
-        changed("watch.alarms", wrong)
-
-
 def test_the_page_is_made_of_the_dataclasses():
     """``python docs/site/results_schema.py > docs/results-schema.md`` writes it."""
     assert (ROOT / "docs" / "results-schema.md").read_text() == SCHEMA["page"]()

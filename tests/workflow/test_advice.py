@@ -278,7 +278,7 @@ def test_without_a_loop_nothing_is_said_to_be_safe(results, why):
 
 
 def test_loops_on_a_model_show_no_safety_and_long_times_are_in_seconds(results):
-    none, own = replace(results.control, rows=(), reason="no plant"), OnModelResult({}, {}, True, ())
+    none, own = replace(results.control, rows=(), reason="no plant"), OnModelResult((), {}, True)
     answer = controller_answer(replace(results, control=none, on_model=own))
     assert answer.verdict == "plain"
     assert answer.short.startswith("Not shown")

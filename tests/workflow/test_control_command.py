@@ -1,7 +1,7 @@
 """``hybrid-mpc control``: loops of an artifact without training, and what it refuses."""
 
-import json
 import shutil
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 from hybrid_mpc import (
     Bench,
     ChannelLimit,
+    Fault,
     InputError,
     Study,
     WatchLimits,
@@ -21,6 +22,7 @@ from hybrid_mpc.compare.study_run import load_models
 from hybrid_mpc.compare.tasks import selected_tasks
 from hybrid_mpc.loop.faults import parsed_fault
 from hybrid_mpc.records import record
+from hybrid_mpc.workflow.control import read_control
 
 GOLF = load_scenario("golf_robot")
 MINE = """
@@ -52,34 +54,38 @@ def test_loops_of_two_controllers(call, run_folder, tmp_path):
     code, told, _ = call("golf_robot", "--model", run_folder, "--out", out, *words)
     assert code == 0
     assert "hybrid_observer" in told
-    results = json.loads((out / "results.json").read_text())
-    assert (results["schema"], results["solver"]) == ("hybrid-mpc control", "rti")
-    assert results["noise"]["source"] == "the model's own"
-    assert [(r["controller"], r["seed"]) for r in results["loops"]] == [
+    results = read_control(out / "results.json")
+    assert results.note.study["solvers"] == ["rti"]
+    (model,) = results.note.models.values()
+    assert model.noise.source == "the model's own"
+    assert set(model.noise.sigma_x) == {"prior", "hybrid_observer"}
+    assert [(r.controller, r.seed) for r in results.loops.rows] == [
         ("prior", 0), ("prior", 1), ("hybrid_observer", 0), ("hybrid_observer", 1),
     ]  # fmt: skip
-    cell = results["summary"]["stroke_1.4"]["prior"]
-    costs = [r["cost"] for r in results["loops"] if r["controller"] == "prior"]
+    cell = results.loops.means["stroke_1.4"]["prior"]
+    costs = [r.cost for r in results.loops.rows if r.controller == "prior"]
     # Two values: mean +- t(0.975, 1) |difference| / 2, the table's t is 12.7062.
-    assert cell["cost"]["mean"] == pytest.approx(np.mean(costs), rel=1e-12)
-    assert cell["cost"]["ci95"] == pytest.approx(12.7062 * abs(costs[0] - costs[1]) / 2, rel=1e-5)
-    assert {"speed_error_rel", "timing_error_s"} <= set(cell["figures"])
-    assert sum(cell["sources"].values()) == pytest.approx(1.0)
-    times = results["step_ms"]["prior"]
-    assert 0 < times["median"] <= times["p95"] <= times["p99"] <= times["max"]
-    assert all(v <= 0.2 for r in results["loops"] for v in r["largest_u"].values())  # a putt's limit
+    assert cell.cost.mean == pytest.approx(np.mean(costs), rel=1e-12)
+    assert cell.cost.ci95 == pytest.approx(12.7062 * abs(costs[0] - costs[1]) / 2, rel=1e-5)
+    assert {"speed_error_rel", "timing_error_s"} <= set(cell.figures)
+    assert sum(cell.sources.values()) == pytest.approx(1.0)
+    times = results.step_ms["prior"]
+    assert 0 < times.median <= times.p95 <= times.p99 <= times.max
+    assert times.period == pytest.approx(20.0)
+    assert all(v <= 0.2 for r in results.loops.rows for v in r.largest_u.values())  # a putt's limit
     drawn = {p.name for p in (out / "figures").iterdir()}
     assert drawn == {"stroke_1.4.png", "stroke_1.4.gif", "step_times.png"}
     again = tmp_path / "again"
     words = [*words[:4], *words[6:]]  # without the hybrid
     assert call("golf_robot", "--model", run_folder / "model", "--out", again, "--no-gif", *words)[0] == 0
     assert not (again / "figures" / "stroke_1.4.gif").exists()
-    repeated = json.loads((again / "results.json").read_text())
-    for r in (*results["loops"], *repeated["loops"]):
-        del r["timing_ms"]
-        assert "arrays" not in r
-    assert repeated["loops"] == results["loops"][:2]
-    assert repeated["summary"]["stroke_1.4"]["prior"] == cell
+    repeated = read_control(again / "results.json")
+    first, second = (
+        [replace(r, timing_ms={}) for r in rows[:2]] for rows in (results.loops.rows, repeated.loops.rows)
+    )
+    assert first == second
+    assert "arrays" not in (again / "results.json").read_text()
+    assert repeated.loops.means["stroke_1.4"]["prior"] == cell
 
 
 @pytest.mark.full
@@ -113,9 +119,9 @@ def test_ctrl_c_loses_no_finished_loop(call, run_folder, tmp_path, monkeypatch):
     assert (code, "seeds differ" in error) == (2, True)
     assert call(*words, "--resume")[0] == 0
     assert begun == [0, 1, 1]
-    results = json.loads((out / "results.json").read_text())
-    assert [row["seed"] for row in results["loops"]] == [0, 1]
-    assert results["step_ms"]["prior"]["median"] > 0
+    results = read_control(out / "results.json")
+    assert [row.seed for row in results.loops.rows] == [0, 1]
+    assert results.step_ms["prior"].median > 0
 
 
 def test_a_fault_from_the_command_line_acts(call, short, run_folder, tmp_path):
@@ -124,16 +130,15 @@ def test_a_fault_from_the_command_line_acts(call, short, run_folder, tmp_path):
         out = tmp_path / name
         options = ["--task", "track_sine", "--controller", "prior", "--seeds", 1, "--no-gif", *words]
         assert call(short, "--model", run_folder, "--out", out, *options)[0] == 0
-        results = json.loads((out / "results.json").read_text())
-        costs[name] = results["loops"][0]["cost"]
-    assert results["faults"] == [
-        {"target": "plant_friction", "value": 4.0, "channel": "", "start_s": 0.5, "end_s": "inf"}
-    ]
-    assert (results["guard"], results["reaction"]) == (None, "")
-    assert results["loops"][0]["alarms"] is None  # nothing could alarm
-    assert results["loops"][0]["switches"] == []
+        results = read_control(out / "results.json")
+        costs[name] = results.loops.rows[0].cost
+    ((fault,),) = results.note.study["faults"]
+    assert record(Fault, fault, "") == Fault(0.5, np.inf, "plant_friction", 4.0)
+    assert results.note.study["guard"] == ""
+    assert results.loops.rows[0].alarms is None  # nothing could alarm
+    assert results.loops.rows[0].switches == ()
     assert costs["worn"] > 2 * costs["healthy"]  # four times the friction on a filter without observer
-    assert results["summary"]["track_sine"]["prior"]["cost"]["ci95"] is None  # one seed
+    assert results.loops.means["track_sine"]["prior"].cost.ci95 is None  # one seed
 
 
 def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, short, run_folder, tmp_path):
@@ -150,14 +155,13 @@ def test_a_guarded_loop_lets_go_of_a_frozen_sensor(call, short, run_folder, tmp_
     code, told, _ = call(*words, tmp_path / "guarded", *options, "--guard")
     assert code == 0
     assert "rest from" in told
-    results = json.loads((tmp_path / "guarded" / "results.json").read_text())
-    assert results["controllers"] == ["hybrid_observer"]  # what the guard watches, where none is named
-    assert record(WatchLimits, results["guard"], "") == limits
-    assert results["reaction"] == "rest"
-    (loop,) = results["loops"]
-    assert loop["switches"][0]["after"] == "REST"
-    assert 1.0 <= loop["alarms"][0]["start_s"] < 1.5  # in motion: three steps are predicted at once
-    assert loop["sources"]["SAFE"] > 0.5
+    results = read_control(tmp_path / "guarded" / "results.json")
+    assert results.note.study["guard"] == "rest"
+    (loop,) = results.loops.rows
+    assert loop.controller == "hybrid_observer"  # what the guard watches, where none is named
+    assert loop.switches[0].after == "REST"
+    assert 1.0 <= loop.alarms[0].start_s < 1.5  # in motion: three steps are predicted at once
+    assert loop.sources["SAFE"] > 0.5
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,9 @@ def test_torque_pendulum_on_the_real_recordings(tmp_path):
     # by hand: two gentle pushes off the top, at almost no speed, and a strong one. From 6.7 s on the torque rises by
     # 0.8 N m within 0.2 s, and the pendulum moves by 0.03 rad.
     for start, end in ((6.7, 8.0), (11.0, 13.0), (16.0, 16.5)):
-        assert any(a.file == FILES[0] and start <= a.start_s <= end for a in alarms), (start, end)
-    for alarm in alarms:  # one that a push raised may end within the window after it
-        for window in WINDOWS[alarm.file]:
+        assert any(of == FILES[0] and start <= a.start_s <= end for of, a in alarms), (start, end)
+    for name, alarm in alarms:  # one that a push raised may end within the window after it
+        for window in WINDOWS[name]:
             assert not window.start <= alarm.start_s <= window.end
     # half of what the prior erred by before its smoother knew the jumps of the torque: docs/results has both
     assert rmse["phy"][signal] < 0.08

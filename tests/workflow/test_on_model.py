@@ -1,6 +1,5 @@
 """A machine without plant and tasks: loops on a trained model in its place, labelled so everywhere."""
 
-import json
 import re
 from dataclasses import replace
 
@@ -13,6 +12,7 @@ from hybrid_mpc.check.default_tasks import default_tasks
 from hybrid_mpc.compare.loops import DRAWN_PRIOR, drawn_prior, moves_otherwise, stand_in
 from hybrid_mpc.loop.plant import ModelPlant
 from hybrid_mpc.model.equilibrium import hidden_fixed_point
+from hybrid_mpc.workflow.control import read_control
 from hybrid_mpc.workflow.stages.results import read_results
 from scenarios.simulated import cart_pole, two_heaters, two_tanks
 
@@ -30,8 +30,9 @@ def test_every_task_runs_on_another_model_than_the_controller_s(bare_tanks):
     loops = found.on_model
     assert loops.plants == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_1"}
     assert loops.default_tasks is True
+    assert set(loops.means) == {"step", "hold"}
     for cells in loops.means.values():
-        assert set(cells) == {"step", "hold"}
+        assert set(cells) == set(loops.plants)
         for cell in cells.values():
             assert cell.sources["MPC"] == 1.0
             # within the sensor's noise (1 mm) or a tenth of the step (0.1 m), which takes a while
@@ -60,9 +61,8 @@ def test_control_does_the_same_from_the_artifact(call, bare_tanks, tmp_path):
     words = ("--model", bare_tanks / "run", "--task", "hold", "--seeds", 1, "--out", tmp_path / "loops")
     code, told, error = call("control", bare_tanks / "tanks.py", *words)
     assert code == 0, error
-    found = json.loads((tmp_path / "loops" / "results.json").read_text())
-    assert found["on_model"] == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_1"}
-    assert {row["controller"]: row["on_model"] for row in found["loops"]} == found["on_model"]
+    found = read_control(tmp_path / "loops" / "results.json")
+    assert found.loops.plants == {"prior_observer": "hybrid", "hybrid_observer": "hybrid_1"}
     names = {path.name for path in (tmp_path / "loops" / "figures").glob("hold*.png")}
     assert names == {"hold_prior_observer.png", "hold_hybrid_observer.png"}
     first, second = told.index("prior_observer on the model hybrid,"), told.index("on the model hybrid_1,")

@@ -23,19 +23,16 @@ from hybrid_mpc.compare.loops import (
     arrays_of,
     read_rows,
     run_loops,
-    with_arrays,
     write_rows,
 )
 from hybrid_mpc.compare.sequential import Comparison, compare_costs, hardest, looks
-from hybrid_mpc.compare.summary import Summary, by_task, summaries
+from hybrid_mpc.compare.summary import ClosedLoops, StepTimes, Summary, by_task, step_times, summaries
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.engine import WORKERS, run_jobs
 from hybrid_mpc.files import digest
 from hybrid_mpc.kit.artifact import load
 from hybrid_mpc.kit.parts import LoopSettings, artifact_digest, loop_settings, read_parts
 from hybrid_mpc.loop.loop import Loop
-from hybrid_mpc.loop.realtime import percentiles
-from hybrid_mpc.records import beside
 from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import UNKNOWN, Absent, Stage, source_of, sources
@@ -101,48 +98,18 @@ def parts_of(scenario: Scenario, tasks: Sequence[Task], budget: Budget, seeds: r
 
 
 @dataclass(frozen=True)
-class StepTimes:
-    """Durations of the hybrid controller's whole steps, from measurement to input [ms of wall time].
+class ControlResult(ClosedLoops):
+    """Closed loops on the scenario's plant. Without a plant, only steps are timed, on recordings: array ``step_ms``.
 
     Args:
-        median: Median.
-        p95: 95th percentile.
-        p99: 99th percentile.
-        max: Longest duration.
-        period: Control period.
-        misses: Number of steps that took longer than the period.
-    """
-
-    median: float
-    p95: float
-    p99: float
-    max: float
-    period: float
-    misses: int
-
-
-@dataclass(frozen=True)
-class ControlResult:
-    """Closed loops on the scenario's plant. Without a plant, only steps are timed, on recordings.
-
-    Args:
-        rows: The loops by task, controller and seed.
         most_seeds: Most seeds of a task; its loops stop earlier once its comparison is decided.
-        step_ms: Durations of steps.
+        step_ms: Durations of the hybrid's steps.
         reason: Why there are no loops. Default: empty, there are loops.
-        arrays: Signals for the figures, ``"NUMBER/NAME"`` with the number of the row; without loops ``step_ms``.
     """
 
-    rows: tuple[LoopRow, ...]
     most_seeds: int
     step_ms: StepTimes
     reason: str = ""
-    arrays: Mapping[str, Array] = beside()
-
-    @property
-    def drawn(self) -> list[LoopRow]:
-        """The loops whose signals were kept, with their signals."""
-        return [row for row in with_arrays(self.rows, self.arrays) if row.arrays] if self.rows else []
 
     @cached_property
     def means(self) -> dict[str, dict[str, Summary]]:
@@ -198,16 +165,6 @@ def _steps(rows: Sequence[LoopRow]) -> dict[str, Array]:
         for name in ("prior", "hybrid")
     }
     return {name: np.concatenate(times) for name, times in own.items() if times}
-
-
-def step_times(durations: Array, period: float) -> StepTimes:
-    """Statistics of the durations of steps [ms] for a control period [ms].
-
-    Example:
-        >>> step_times(np.array([1.0, 2.0, 3.0]), 2.5).misses
-        1
-    """
-    return StepTimes(**percentiles(durations), period=period, misses=int((durations > period).sum()))
 
 
 def closed_loops(found: ControlResult | Absent) -> ControlResult | None:
@@ -302,9 +259,8 @@ def _only_timing(context: Context) -> ControlResult:
         durations.append(time_on_recording(controller, estimator, kit.monitor(kind="own"), recording, most))
     reason = f"scenario {context.scenario.name} has no plant to close the loop with"
     times = np.concatenate(durations)
-    return ControlResult(
-        (), context.budget.seeds, step_times(times, 1e3 * context.spec.dt), reason, {"step_ms": times}
-    )
+    timed = step_times(times, 1e3 * context.spec.dt)
+    return ControlResult((), context.budget.seeds, timed, reason, arrays={"step_ms": times})
 
 
 def time_on_recording(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.compare.controllers import CONTROLLERS, OBSERVERS
 from hybrid_mpc.data.scales import evenly
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.consistency import consistency
+from hybrid_mpc.estimate.consistency import Consistency, consistency
 from hybrid_mpc.records import beside
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage
@@ -26,31 +26,6 @@ Array = NDArray[np.float64]
 PERIODS = 1000
 RECORDINGS = 4
 """Periods and number of the test recordings that are used; both observers then take a few seconds."""
-
-
-@dataclass(frozen=True)
-class ObserverTest:
-    """Statistics of an observer's innovations; see :func:`~hybrid_mpc.estimate.consistency.consistency`.
-
-    Args:
-        mean_nis: Mean normalised innovation squared; 1 if the observer's covariance is right.
-        nis_low: Lower end of its 95 % band.
-        nis_high: Upper end.
-        nis_inside: Share of samples below the 95 % quantile.
-        ljung_box: Statistic of their autocorrelation.
-        ljung_box_limit: Its 95 % quantile for white innovations.
-        samples: Number of samples.
-        correlation_band: 95 % band of one autocorrelation.
-    """
-
-    mean_nis: float
-    nis_low: float
-    nis_high: float
-    nis_inside: float
-    ljung_box: float
-    ljung_box_limit: float
-    samples: int
-    correlation_band: float
 
 
 @dataclass(frozen=True)
@@ -77,7 +52,7 @@ class EstimationResult:
     """
 
     recordings: tuple[ObservedRecording, ...]
-    observers: Mapping[str, ObserverTest | Absent]
+    observers: Mapping[str, Consistency | Absent]
     arrays: Mapping[str, Array] = beside()
 
 
@@ -89,20 +64,16 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
         )
     context.read(NOISE)
     kit, parts = context.kit, parts_for_tests(context.trajectories("test"))
-    found: dict[str, ObserverTest | Absent] = {}
+    found: dict[str, Consistency | Absent] = {}
     arrays: dict[str, Array] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
         estimator = kit.observer(CONTROLLERS[name].model, load=CONTROLLERS[name].observer)
         try:
-            tested = consistency(estimator, parts)
+            found[name] = tested = consistency(estimator, parts)
         except InputError as too_short:
             found[name] = Absent(str(too_short))
             continue
-        found[name] = ObserverTest(
-            tested.mean_nis, *tested.nis_band, tested.nis_inside, tested.ljung_box, tested.ljung_box_limit,
-            tested.samples, tested.correlation_band,
-        )  # fmt: skip
         arrays[f"{name}/autocorrelation"] = tested.autocorrelation
         arrays |= {f"{name}/nis/{k}": run.nis for k, run in enumerate(tested.runs)}
     return EstimationResult(tuple(ObservedRecording(p.name, len(p.t)) for p in parts), found, arrays)

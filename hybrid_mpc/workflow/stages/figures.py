@@ -29,7 +29,7 @@ from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION, finite
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.identify import PRIOR, TRAINING, trained_models
-from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, by_controller
+from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.workflow.stages.watch import WATCH, clean_windows, read_trace
 
 Figures = dict[str, list[tuple[Path, str]]]
@@ -240,14 +240,13 @@ def _on_model(context: Context) -> Any:
         return
     scenario = context.ready
     tasks = {task.name: task for task in scenario.tasks}
-    for name, rows in by_controller(found.drawn).items():
-        for row in rows:
-            task = tasks[row.task]
-            control = task.control or scenario.control
-            assert control is not None
-            title = f"{task.title}, {name}, {ON_MODEL} ({row.on_model})"
-            figure = loop_figure(title, control, scenario.prior(), {f"{name} on {row.on_model}": row.arrays})
-            yield "on_model", f"on_model_{task.name}_{name}", figure, f"{title}; first seed."
+    for row in sorted(found.drawn, key=lambda row: OBSERVERS.index(row.controller)):
+        task, name = tasks[row.task], row.controller
+        control = task.control or scenario.control
+        assert control is not None
+        title = f"{task.title}, {name}, {ON_MODEL} ({row.on_model})"
+        figure = loop_figure(title, control, scenario.prior(), {f"{name} on {row.on_model}": row.arrays})
+        yield "on_model", f"on_model_{task.name}_{name}", figure, f"{title}; first seed."
 
 
 def _overview(context: Context) -> Any:
@@ -303,7 +302,7 @@ def _estimation(context: Context) -> Any:
             continue
         figure = estimation.innovations(
             [arrays[f"{name}/nis/{i}"] for i in range(len(found.recordings))], arrays[f"{name}/autocorrelation"],
-            dt=context.spec.dt, outputs=context.scenario.prior().outputs, mean_band=(own.nis_low, own.nis_high),
+            dt=context.spec.dt, outputs=context.scenario.prior().outputs, mean_band=own.nis_band,
             correlation_band=own.correlation_band, title=OBSERVER_TITLES[name],
         )  # fmt: skip
         caption = f"{OBSERVER_TITLES[name]}: innovations on test recordings."
@@ -334,7 +333,7 @@ def _watch(context: Context) -> Any:
     whole = {r.name: r for r in context.dataset.whole}
     for name in found.shown:
         windows = clean_windows(context, whole[name], ("train", "valid", "test", "nominal"))
-        notes = [(a.start_s, a.diagnosis) for a in found.alarms if a.file == name and a.diagnosis]
+        notes = [(a.start_s, a.diagnosis) for of, a in found.alarms if of == name and a.diagnosis]
         figure = drawn(name, windows=windows, notes=notes, title=name)
         caption = f"The monitor over the whole recording {name}."
         yield "watch", f"monitor_{name.replace('#', '-')}", figure, caption
@@ -351,7 +350,7 @@ def _analysis(context: Context) -> Any:
     if isinstance(found, Absent):
         return
     arrays = found.arrays
-    poles = {n: np.array([complex(*z) for z in found.models[n].rest.poles]) for n in ("prior", "hybrid")}
+    poles = {n: [mode.pole for mode in found.models[n].points["rest"]] for n in ("prior", "hybrid")}
     figure = analysis.pole_map(poles, context.spec.dt)
     yield "analysis", "poles", figure, "Poles of the one-step maps at rest."
     prior = context.scenario.prior()
@@ -360,15 +359,10 @@ def _analysis(context: Context) -> Any:
     for point in ("rest", "moving"):
         if any(point not in found.models[n].points for n in poles):
             continue  # a network that corrects every rate leaves no signal that is exactly a speed
-        for (i, output), (j, into) in product(enumerate(prior.outputs), enumerate(prior.inputs)):
-            responses = {}
-            for n in poles:
-                omega, size, phase = (arrays[f"{n}/{point}/{k}"] for k in ("omega", "magnitude", "phase"))
-                responses[n] = omega, size[i, j], phase[i, j]
-            figure = analysis.bode(
-                responses, input_signal=into, output_signal=output, nyquist=np.pi / context.spec.dt
-            )
-            several = len(prior.outputs) * len(prior.inputs) > 1
-            named = f"bode_{point}_from_{into.name}_to_{output.name}" if several else f"bode_{point}"
-            channel = f", from {into.name} to {output.name}" if several else ""
-            yield "analysis", named, figure, f"Bode plot of prior and hybrid {titles[point]}{channel}."
+        responses = {
+            n: (arrays[f"{n}/{point}/omega"], arrays[f"{n}/{point}/magnitude"], arrays[f"{n}/{point}/phase"])
+            for n in poles
+        }
+        for named, channel, figure in analysis.bodes(responses, prior.inputs, prior.outputs, context.spec.dt):
+            caption = f"Bode plot of prior and hybrid {titles[point]}{channel}."
+            yield "analysis", f"bode_{point}{named}", figure, caption

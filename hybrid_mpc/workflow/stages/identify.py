@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.check.preflight import warn_of_drift
 from hybrid_mpc.data import scales
 from hybrid_mpc.data.excitation import check_excitation, short_runs
-from hybrid_mpc.data.trajectories import ROLES, Trajectory
+from hybrid_mpc.data.trajectories import ROLES, Cut, Trajectory
 from hybrid_mpc.engine import WORKERS, run_jobs
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import digest, read_document, read_document_arrays, sha256, write_document
@@ -97,28 +97,11 @@ class DataResult:
 
     files: tuple[str, ...]
     hash: str
-    cuts: tuple[CutPart, ...]
+    cuts: tuple[Cut, ...]
     pieces: Mapping[str, int]
     seconds: Mapping[str, float]
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class CutPart:
-    """A part of a recording that is cut out or interpolated.
-
-    Args:
-        file: Name of the recording.
-        start_s: Start [s] in the recording's own time: the last sample before it.
-        end_s: End [s]: the first sample after it.
-        why: Its reason.
-    """
-
-    file: str
-    start_s: float
-    end_s: float
-    why: str
 
 
 @dataclass(frozen=True)
@@ -237,7 +220,7 @@ def data_stage(context: Context) -> DataResult:
     return DataResult(
         tuple(dataset.files),
         dataset.hash,
-        tuple(CutPart(*cut) for cut in dataset.cuts),
+        dataset.cuts,
         {role: len(context.trajectories(role)) for role in ROLES},
         {role: sum(len(t.t) * t.dt for t in context.trajectories(role)) for role in ROLES},
         warnings,

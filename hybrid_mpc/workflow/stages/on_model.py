@@ -2,62 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hybrid_mpc.compare.controllers import OBSERVERS
-from hybrid_mpc.compare.loops import DRAWN, MODEL, LoopRow, LoopSpec, arrays_of, stand_in, with_arrays
-from hybrid_mpc.compare.summary import Summary, summaries
+from hybrid_mpc.compare.loops import DRAWN, MODEL, LoopSpec, arrays_of, stand_in
+from hybrid_mpc.compare.summary import ClosedLoops
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.kit.parts import loop_settings
-from hybrid_mpc.records import beside
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage
 from hybrid_mpc.workflow.stages.compare import run_or_read, task_content
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, observed
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
-class OnModelResult:
+class OnModelResult(ClosedLoops):
     """Closed loops for a scenario without plant, each on another model than the controller's own.
 
     They show whether two models agree, and nothing about the machine. Each controller has another plant, so do not
     compare their figures.
 
     Args:
-        plants: Name of the model in place of the machine, by controller.
         left_out: Why a controller has no loops, by controller.
         default_tasks: Whether the tasks are default ones: the scenario declares none.
-        rows: The loops by task, controller and seed.
-        arrays: Signals that are drawn, ``"NUMBER/NAME"`` with the number of the row.
     """
 
-    plants: Mapping[str, str]
     left_out: Mapping[str, str]
     default_tasks: bool
-    rows: tuple[LoopRow, ...]
-    arrays: Mapping[str, Array] = beside()
-
-    @property
-    def drawn(self) -> list[LoopRow]:
-        """The loops whose signals were kept, with their signals."""
-        return [row for row in with_arrays(self.rows, self.arrays) if row.arrays]
-
-    @cached_property
-    def means(self) -> dict[str, dict[str, Summary]]:
-        """Means of the loops by controller and task."""
-        return {
-            name: {task: cells[name] for task, cells in summaries(rows).items()}
-            for name, rows in by_controller(self.rows).items()
-            if rows
-        }
 
 
 def on_model_stage(context: Context) -> OnModelResult | Absent:
@@ -72,11 +45,10 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
     except InputError as none:
         return Absent(str(none))
     settings = context.settings
-    plants: dict[str, str] = {}
     left_out: dict[str, str] = {}
     for name in OBSERVERS:
         try:
-            plants[name] = stand_in(context.kit, name).model.name
+            stand_in(context.kit, name)
         except InputError as none:
             left_out[name] = str(none)
     parts = {
@@ -88,11 +60,12 @@ def on_model_stage(context: Context) -> OnModelResult | Absent:
             for seed in range(context.budget.seeds)
         ]
         for task in tasks
-        for name in plants
+        for name in OBSERVERS
+        if name not in left_out
     }  # fmt: skip
     found = run_or_read(context, parts)
     rows = [row for part in parts for row in found[part]]
-    return OnModelResult(plants, left_out, not context.scenario.tasks, tuple(rows), arrays_of(rows))
+    return OnModelResult(tuple(rows), left_out, not context.scenario.tasks, arrays=arrays_of(rows))
 
 
 def what_on_model_reads(context: Context) -> dict[str, object]:
@@ -115,11 +88,6 @@ def what_on_model_reads(context: Context) -> dict[str, object]:
     for task in tasks_of(whole, budget.tasks):
         read[f"task {task.name}"] = task_content(task, context.spec.dt, loop)
     return read
-
-
-def by_controller(rows: Sequence[LoopRow]) -> dict[str, list[LoopRow]]:
-    """The loops by controller: each controller has another plant, so they must not be compared."""
-    return {name: [row for row in rows if row.controller == name] for name in OBSERVERS}
 
 
 LOOPS_ON_MODEL = Stage(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,20 +34,7 @@ SEARCH = "hybrid-mpc explain looks for missing terms (docs/explain.md)."
 """Remedy for a prior that may lack a term."""
 
 
-@dataclass(frozen=True)
-class PromisesResult:
-    """The table "What this kit promises".
-
-    Args:
-        rows: Its rows in their order.
-        of: Digest of the kit that was examined.
-    """
-
-    rows: tuple[Promise, ...]
-    of: str = ""
-
-
-def promises_stage(context: Context) -> PromisesResult | Absent:
+def promises_stage(context: Context) -> PromiseTable | Absent:
     """Examine the recommended model's loop, and write ``promises.json`` beside the models."""
     if context.scenario.control is None and not any(task.control for task in context.scenario.tasks):
         return Absent(f"scenario {context.scenario.name} defines no control problem")
@@ -73,7 +59,7 @@ def promises_stage(context: Context) -> PromisesResult | Absent:
         context.read(CHOICE).choice,
         None if isinstance(explained, Absent) else explained.explanation,
     )
-    result = PromisesResult((of_prior, *found), kit.identity)
+    result = PromiseTable((of_prior, *found), kit.identity)
     put_promises(context, result)
     return result
 
@@ -135,9 +121,7 @@ def _loops(context: Context, controller: str) -> tuple[list[LoopRow], str]:
     """The run's loops of a controller with their kept signals, and a text that names their plant."""
     control, on_model = context.find(CONTROL), context.find(LOOPS_ON_MODEL)
     if not isinstance(control, Absent) and control.rows:
-        drawn = {(row.task, row.controller, row.seed): row for row in control.drawn}
-        rows = [drawn.get((row.task, row.controller, row.seed), row) for row in control.rows]
-        return [row for row in rows if row.controller == controller], "on the scenario's plant"
+        return [row for row in control.kept if row.controller == controller], "on the scenario's plant"
     if isinstance(on_model, Absent):
         return [], ""
     rows = [row for row in on_model.drawn if row.controller == controller]
@@ -156,9 +140,9 @@ def _tested(context: Context, controller: str, n_y: int) -> Tested | str:
     return Tested(correlation, own.mean_nis / n_y, own.samples)
 
 
-def put_promises(context: Context, found: PromisesResult) -> str:
+def put_promises(context: Context, table: PromiseTable) -> str:
     """Write the table beside the models, unless the same table is already there."""
-    folder, table = context.out / "model", PromiseTable(found.of, found.rows)
+    folder = context.out / "model"
     try:
         there = read_promises(folder) == table
     except InputError:  # damaged or of another version: write it again
@@ -174,6 +158,6 @@ def what_promises_read(context: Context) -> Mapping[str, object]:
 
 
 PROMISES = Stage(
-    "promises", "examining the kit's promises", PromisesResult, promises_stage, what_promises_read,
+    "promises", "examining the kit's promises", PromiseTable, promises_stage, what_promises_read,
     (EXPLAIN, PRIOR, CHOICE, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
 )  # fmt: skip

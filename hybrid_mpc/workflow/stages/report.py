@@ -11,11 +11,12 @@ from typing import Any
 
 from scipy.stats import chi2
 
+from hybrid_mpc.analyze.properties import stabilisable_detectable
 from hybrid_mpc.compare.controllers import CONTROLLERS
 from hybrid_mpc.compare.loops import DRAWN_PRIOR, ON_MODEL
 from hybrid_mpc.compare.sequential import SAME, hardest
 from hybrid_mpc.compare.step_response import step_responses
-from hybrid_mpc.compare.summary import Summary
+from hybrid_mpc.compare.summary import StepTimes, Summary
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.evaluate import OutputErrors
@@ -25,14 +26,15 @@ from hybrid_mpc.records import plain
 from hybrid_mpc.report.page import Report, Section, Table, words, write_report
 from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.watch.detector import WatchLimits
+from hybrid_mpc.watch.explain import WatchedRecording
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explain_page import steps_table, terms_table, tests_table, trials_table
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.advice import advice, doubt_of
-from hybrid_mpc.workflow.stages.analyze import AnalysisResult
+from hybrid_mpc.workflow.stages.analyze import LinearizedModels
 from hybrid_mpc.workflow.stages.answers import answer_all
 from hybrid_mpc.workflow.stages.choose import CHOICE, ChoiceResult
-from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, StepTimes, closed_loops
+from hybrid_mpc.workflow.stages.compare import REPORTED, ControlResult, closed_loops
 from hybrid_mpc.workflow.stages.estimate import EstimationResult
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult, finite
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
@@ -42,7 +44,7 @@ from hybrid_mpc.workflow.stages.identify import DATA, DataResult, models_of, tra
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect
 from hybrid_mpc.workflow.stages.track import TrackResult
-from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchedRecording, WatchResult
+from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
 
 TITLES: Mapping[str, str] = {
     "promises": "What this kit promises",
@@ -311,7 +313,7 @@ def coverage_words(recordings: Sequence[WatchedRecording]) -> tuple[str, ...]:
     """A sentence on parts of the recordings that were not monitored, warm-up apart; empty without such a part.
 
     Example:
-        >>> coverage_words([WatchedRecording("monday", valid_s=4.0, warm_up_s=0.3, missing_s=0.0, not_finite_s=2.0)])
+        >>> coverage_words([WatchedRecording("monday", 6.3, 4.0, 0.3, missing_s=0.0, not_finite_s=2.0, alarms=())])
         ('Not monitored: 2 s with a non-finite value of model or estimator.',)
     """
     sums = {
@@ -534,7 +536,8 @@ def _response_table(context: Context, found: ControlResult) -> Table:
 def _on_model_tables(found: OnModelResult) -> list[Table]:
     """One table for each controller: their plants differ, so one table must not compare two controllers."""
     tables = []
-    for name, cells in found.means.items():
+    for name, plant in found.plants.items():
+        cells = {task: own[name] for task, own in found.means.items()}
         signals, errors = _tracking(list(cells.values()))
         rows = [
             (task, _cost(cell), *own, f"{100 * max(cell.limits.values(), default=0.0):.0f} %",
@@ -542,7 +545,7 @@ def _on_model_tables(found: OnModelResult) -> list[Table]:
             for (task, cell), own in zip(cells.items(), errors, strict=True)
         ]  # fmt: skip
         caption = (
-            f"Controller {name.replace('_', ', ')} on the model {found.plants[name]} in place of the machine: "
+            f"Controller {name.replace('_', ', ')} on the model {plant} in place of the machine: "
             f"{ON_MODEL}. Cost J on the model's state, root mean square deviations from the reference, means over "
             "seeds."
         )
@@ -569,7 +572,7 @@ def _cost(cell: Summary | None) -> str:
 
 def _observer_table(found: EstimationResult) -> Table:
     rows = [
-        (OBSERVER_TITLES[name], r.mean_nis, f"{r.nis_low:.2f} to {r.nis_high:.2f}", f"{100 * r.nis_inside:.0f} %",
+        (OBSERVER_TITLES[name], r.mean_nis, "{:.2f} to {:.2f}".format(*r.nis_band), f"{100 * r.nis_inside:.0f} %",
          f"{r.ljung_box:.0f}", f"{r.ljung_box_limit:.0f}", r.samples)
         for name, r in found.observers.items()
         if not isinstance(r, Absent)
@@ -625,7 +628,9 @@ def _watch_tables(found: WatchResult) -> list[Table]:
         tables.append(
             Table(heads, rows, f"Closed loops of the task {found.faults[0].task} with a simulated fault.")
         )
-    alarms = [(a.file, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for a in found.alarms]
+    alarms = [
+        (name, a.start_s, a.end_s, ", ".join(a.channels), a.diagnosis or None) for name, a in found.alarms
+    ]
     heads = ("recording", "from [s]", "to [s]", "channels", "diagnosis")
     return [*tables, Table(heads, alarms, "Alarms over the whole recordings.")]
 
@@ -687,13 +692,13 @@ def _delays_of(faults: Sequence[FaultedLoop]) -> tuple[str, str]:
     return "; ".join(after), "; ".join(causes)
 
 
-def _pole_table(analysis: AnalysisResult) -> Table:
+def _pole_table(analysis: LinearizedModels) -> Table:
     rows = []
     for model, found in analysis.models.items():
-        for point, a in found.points.items():
-            slow = [f"{number(w)} ({z:.2f})" for w, z in
-                    list(zip(a.frequency_rad_s, a.damping, strict=True))[:2] if w is not None]  # fmt: skip
-            rows.append((model, point, ", ".join(slow), a.stable, a.stabilisable, a.detectable))
+        for point, own in found.points.items():
+            slow = [f"{number(m.frequency)} ({m.damping:.2f})" for m in own[:2] if m.pole != 0]
+            stable = all(abs(m.pole) < 1.0 for m in own)
+            rows.append((model, point, ", ".join(slow), stable, *stabilisable_detectable(own)))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
     points = {"rest": "at rest", "moving": "at working speed"}
     there = [points[p] for p in points if any(p in found.points for found in analysis.models.values())]

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from hybrid_mpc.errors import InputError
-from hybrid_mpc.files import read_object
-from hybrid_mpc.records import record
+from hybrid_mpc.kit.promises import PromiseTable
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explained import ExplainResult
-from hybrid_mpc.workflow.stage import Absent, Stage
-from hybrid_mpc.workflow.stages.analyze import ANALYSIS, AnalysisResult
+from hybrid_mpc.workflow.stage import Absent, Stage, read_as
+from hybrid_mpc.workflow.stages.analyze import ANALYSIS, LinearizedModels
 from hybrid_mpc.workflow.stages.choose import CHOICE, ChoiceResult
 from hybrid_mpc.workflow.stages.compare import CONTROL, ControlResult
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION, EstimationResult
@@ -22,12 +20,11 @@ from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, ExportResult, NoiseResult
 from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, DataResult, PriorResult, TrainingResult
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, OnModelResult
-from hybrid_mpc.workflow.stages.promises import PROMISES, PromisesResult
+from hybrid_mpc.workflow.stages.promises import PROMISES
 from hybrid_mpc.workflow.stages.track import TRACK, TrackResult
 from hybrid_mpc.workflow.stages.watch import WATCH, WatchResult
 
-R = TypeVar("R")
-SCHEMA_VERSION = 12
+SCHEMA_VERSION = 13
 SHOWN: tuple[Stage[Any], ...] = (
     DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, TRACK, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION,
     PROMISES, WATCH, ANALYSIS,
@@ -79,9 +76,9 @@ class Results:
     control: ControlResult | Absent
     on_model: OnModelResult | Absent
     estimation: EstimationResult | Absent
-    promises: PromisesResult | Absent
+    promises: PromiseTable | Absent
     watch: WatchResult | Absent
-    analysis: AnalysisResult | Absent
+    analysis: LinearizedModels | Absent
 
 
 def collect(context: Context) -> Results:
@@ -103,18 +100,3 @@ def read_results(path: Path) -> Results:
         ``read_results(Path("runs/mine/results.json")).choice.choice.recommended``
     """
     return read_as(Results, SCHEMA_VERSION, path, "the run")
-
-
-def read_as(kind: type[R], version: int, path: Path, command: str) -> R:
-    """Read a ``results.json`` of this kind and version; ``command`` writes it.
-
-    Raises:
-        InputError: If the file is missing, damaged, or of another version.
-    """
-    document = read_object(path)
-    if (found := document.get("schema_version")) != version:
-        raise InputError(
-            f"{path}: schema_version is {str(found)[:20]}, but this version reads {version}. Write the file again: "
-            f"repeat the command of {command} (of a run with --resume) [HM-WORKFLOW-040]"
-        )
-    return record(kind, document, str(path))

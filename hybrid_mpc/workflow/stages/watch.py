@@ -24,7 +24,7 @@ from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
-from hybrid_mpc.watch.explain import begun, explained
+from hybrid_mpc.watch.explain import Alarm, WatchedRecording, begun, explained
 from hybrid_mpc.watch.learn import limits_of
 from hybrid_mpc.watch.lengths import rest_speeds
 from hybrid_mpc.watch.monitor import Monitor, make_readings, reads_energy
@@ -74,32 +74,6 @@ def rates(scenario: Scenario, model: HybridModel) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class RecordedAlarm:
-    """An alarm on a recording.
-
-    Args:
-        file: Name of the recording.
-        start_s: Start [s] in the recording's own time.
-        end_s: End [s].
-        channels: Channels in the order of their alarms.
-        diagnosis: Its cause; empty without a diagnosis.
-    """
-
-    file: str
-    start_s: float
-    end_s: float
-    channels: tuple[str, ...] = ()
-    diagnosis: str = ""
-
-    def __post_init__(self) -> None:
-        if not self.start_s <= self.end_s:
-            raise InputError(
-                f"{self.file}: alarm ends at {self.end_s} s, before its start at {self.start_s} s. Correct the interval"
-                " [HM-WORKFLOW-043]"
-            )
-
-
-@dataclass(frozen=True)
 class CleanAlarms:
     """False alarms in undisturbed data.
 
@@ -139,25 +113,6 @@ class CleanAlarms:
             f"{self.alarms} in {self.seconds:.0f} s of undisturbed data; {self.expected(per_hour):.2g} are expected "
             f"at {two_digits(per_hour)} false alarms an hour"
         )
-
-
-@dataclass(frozen=True)
-class WatchedRecording:
-    """How long a recording was monitored.
-
-    Args:
-        file: Name of the recording.
-        valid_s: Time with a valid reading [s].
-        warm_up_s: Time until all windows were full [s].
-        missing_s: Time with missing samples [s].
-        not_finite_s: Time with a non-finite value of model or estimator [s].
-    """
-
-    file: str
-    valid_s: float
-    warm_up_s: float
-    missing_s: float
-    not_finite_s: float
 
 
 @dataclass(frozen=True)
@@ -217,8 +172,7 @@ class WatchResult:
         reason: Why there are no limits. Default: limits were learned.
         loops: Loops that limits were learned from. Default: none, limits were learned from recordings.
         channels: The channels. Default: none.
-        recordings: How long each recording was monitored.
-        alarms: Alarms on whole recordings.
+        recordings: The whole recordings with their alarms.
         clean: False alarms.
         by_channel: False alarms of each channel and of each frozen-sensor check.
         faults: Loops with a fault; None if none were run.
@@ -235,7 +189,6 @@ class WatchResult:
     loops: tuple[NominalLoop, ...] = ()
     channels: tuple[Channel, ...] = ()
     recordings: tuple[WatchedRecording, ...] = ()
-    alarms: tuple[RecordedAlarm, ...] = ()
     clean: CleanAlarms | None = None
     by_channel: Mapping[str, CleanAlarms] = field(default_factory=dict)
     faults: tuple[FaultedLoop, ...] | None = None
@@ -243,6 +196,11 @@ class WatchResult:
     shown: tuple[str, ...] = ()
     wanted: float = RATES[0]
     arrays: Mapping[str, Array] = beside()
+
+    @property
+    def alarms(self) -> tuple[tuple[str, Alarm], ...]:
+        """Alarms on whole recordings, behind the name of the recording."""
+        return tuple((row.recording, alarm) for row in self.recordings for alarm in row.alarms)
 
     @property
     def limits(self) -> WatchLimits | None:
@@ -396,15 +354,19 @@ def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResul
         made.extend([] if made else [kit.diagnoser()])
         return made[0]
 
-    traces, alarms = [], []
+    traces, rows = [], []
     for recording, say in along(whole, context.progress.update):
         trace, own = explained(monitor, estimator, recording, diagnoser, say)
         traces.append(trace)
-        alarms += [RecordedAlarm(recording.name, a.start_s, a.end_s, a.channels, a.diagnosis) for a in own]
+        seconds = len(recording.t) * recording.dt
+        rows.append(WatchedRecording(recording.name, seconds, **trace.coverage(recording.dt), alarms=own))
     every = [np.hstack([t.on, t.frozen]) for t in traces]
     names = traces[0].names if traces else ()
     each = {name: clean_alarms(context, whole, [on[:, i] for on in every]) for i, name in enumerate(names)}
-    alarmed, tested = {a.file for a in alarms}, {t.file for t in context.trajectories("test")}
+    alarmed, tested = (
+        {row.recording for row in rows if row.alarms},
+        {t.file for t in context.trajectories("test")},
+    )
     ranked = sorted(
         zip(whole, traces, strict=True),
         key=lambda pair: (pair[0].name not in alarmed, pair[0].file not in tested),
@@ -413,10 +375,7 @@ def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResul
     for recording, trace in ranked:
         arrays |= trace_arrays(recording.name, trace, recording.y)
     return replace(
-        found, channels=monitor.readings.channels, alarms=tuple(alarms), by_channel=each, arrays=arrays,
-        recordings=tuple(
-            WatchedRecording(r.name, **t.coverage(monitor.model.dt)) for r, t in zip(whole, traces, strict=True)
-        ),
+        found, channels=monitor.readings.channels, recordings=tuple(rows), by_channel=each, arrays=arrays,
         clean=clean_alarms(context, whole, [t.alarm for t in traces]), shown=tuple(r.name for r, _ in ranked),
     )  # fmt: skip
 
