@@ -248,6 +248,15 @@ def _check_recordings(
         return None
     for doubtful in dataset.warnings:
         report.warn(f"recordings: {doubtful}")
+    late = {
+        n: shift for file in dataset.files for n, shift in spec.delays_in(Path(file).stem).items() if shift
+    }
+    if late:
+        report.warn(
+            f"delays: {', '.join(f'{name} {shift:g} s' for name, shift in late.items())} are removed from the "
+            "recordings, and the deployed model does not contain them. Inputs that act late in operation too: set "
+            "largest_delay instead. Outputs that arrive late in operation: use DelayCompensation (docs/clocks.md)"
+        )
     for file, sampling in zip(dataset.files, dataset.sampling, strict=True):
         if sampling > COARSE * spec.dt:
             report.warn(

@@ -90,14 +90,14 @@ def check(
         raise typer.Exit(WRONG)
     if in_doubt:
         console.print("\nCorrect the prior before a run; docs/prior-wrong.md explains each doubt.")
-        if lacking:
-            words = ["hybrid-mpc", "explain", scenario, *settings.options(str)]
-            console.print(
-                f"A physical term may be missing: '{shlex.join(words)}' searches for it (docs/explain.md).",
-                markup=False, soft_wrap=True,
-            )  # fmt: skip
-        return
-    console.print(f"\n{_end(len(left), len(warnings), recorded=bool(data or fit))}")
+    else:
+        console.print(f"\n{_end(len(left), len(warnings), recorded=bool(data or fit))}")
+    if lacking:
+        words = ["hybrid-mpc", "explain", scenario, *settings.options(str)]
+        console.print(
+            f"{lacking[0]}: '{shlex.join(words)}' searches for a missing term (docs/explain.md).",
+            markup=False, soft_wrap=True,
+        )  # fmt: skip
 
 
 def _end(left: int, warnings: int, *, recorded: bool) -> str:
@@ -118,8 +118,8 @@ def _end(left: int, warnings: int, *, recorded: bool) -> str:
 
 
 def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], ...]:
-    """Fit the prior and print the results; return errors, warnings, doubts about the structure, and those of them that
-    a missing term can explain.
+    """Fit the prior and print the results; return errors, warnings, doubts about the structure, and the reason to
+    search for missing terms.
     """
     from dataclasses import replace
 
@@ -136,7 +136,16 @@ def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], ...]:
     prior = context.scenario.prior()
     console.print(_fitted_parameters(prior, found))
     console.print(_free_runs(prior, found))
-    return stops(found, cause=False), found.fit.warnings, found.in_doubt, found.lacking
+    fitted = found.errors["phy"].error
+    better = [n for n, one in found.baselines.items() if one.errors is not None and one.errors.error < fitted]
+    why = (
+        "A physical term may be missing"
+        if found.lacking
+        else f"{better[0]} predicts better"
+        if better
+        else ""
+    )
+    return stops(found, cause=False), found.fit.warnings, found.in_doubt, (why,) if why else ()
 
 
 def _fitted_parameters(prior: Prior, found: PriorResult) -> Table:

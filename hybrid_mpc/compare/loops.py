@@ -662,8 +662,8 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
     """The model that replaces a missing plant: the hybrid for the prior's controller, and the best single network of
     the hybrid for the hybrid's controller.
 
-    If these models behave like the controller's own model (correction of zero), it is the prior with parameters drawn
-    from their fitted covariance (:data:`DRAWN_PRIOR`).
+    If the kit has none, or if they behave like the controller's own model (correction of zero), it is the prior with
+    parameters drawn from their fitted covariance (:data:`DRAWN_PRIOR`).
 
     Raises:
         InputError: If the controller is an oracle's, or the artifact has no other model than the controller's.
@@ -676,13 +676,6 @@ def stand_in(kit: Kit, controller: str) -> ModelPlant:
         )
     held = kit.models.get("hybrid")
     others = kit.members.values() if of == "hybrid" else () if held is None else (held,)
-    if not others:
-        needed = "a hybrid" if of == "prior" else "a network of its training alone"
-        raise InputError(
-            f"controller {controller}: scenario {kit.name} has no plant, and its kit lacks {needed} to replace it. Run "
-            "the scenario with at least 2 networks (networks of the budget), omit this controller, or write a plant "
-            "[HM-COMPARE-013]"
-        )
     own = kit.models[of]
     problem = next(iter(kit.loop.control.values()), None)
     inputs = None if problem is None else (problem.u_min, problem.u_max)

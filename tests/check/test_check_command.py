@@ -106,6 +106,17 @@ def test_what_is_marked_is_counted_at_the_end(call, machine, tmp_path):
     assert "1 errors" not in told
 
 
+def test_declared_delays_are_not_in_the_deployed_model(call, machine, tmp_path):
+    text = (machine / "my_machine.py").read_text()
+    given = text.replace("dt=0.02", 'delays={"phi_rad": 0.04}, dt=0.02', 1)
+    assert given != text
+    (tmp_path / "late.py").write_text(given)
+    for path, warned in ((machine / "my_machine.py", False), (tmp_path / "late.py", True)):
+        code, told = checked(call, path, "--data", machine / "monday.csv")
+        assert code == 0
+        assert ("phi_rad 0.04 s" in told) == warned
+
+
 @pytest.mark.full
 def test_a_machine_in_casadi_is_checked_without_torch(machine):
     words = ["check", str(machine / "my_machine.py"), "--data", str(machine / "monday.csv")]

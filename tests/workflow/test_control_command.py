@@ -200,7 +200,7 @@ def test_bad_models(call, run_folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "told"),
-    [("plant=None", "HM-COMPARE-013"), ("control=None", "HM-COMPARE-015"),
+    [("plant=None", "HM-COMPARE-014"), ("control=None", "HM-COMPARE-015"),
      ("tasks=()", "no task"),
      ("make_data=None", "HM-COMPARE-002"), ("oracle=None", "has no oracle")],
 )  # fmt: skip
