@@ -111,6 +111,15 @@ def test_an_input_without_effect_at_rest_carries_no_load(gain, expected):
     assert needed(model, problem) == pytest.approx(at_rest * (1.0 + 0.5 * gain), rel=1e-4)
 
 
+def test_beside_an_input_without_effect_every_measured_state_has_its_own():
+    parameters = (Parameter("p", 1.0, "1/s", 0.1, 5.0),)
+    model = model_of(
+        lambda x, p: ca.vertcat(1.0 - p * x[0], x[0] - x[1]), [[0.01], [0.0]], parameters, bounds=2.0
+    )
+    model = replace(model, nominal_x=(1.0, 1.0), nominal_u=(0.0,))
+    assert places(model, PROBLEM) == [("rate", "x0"), ("rate", "x1")]
+
+
 def test_references_of_states_have_one_at_each_input():
     assert default_disturbances(two_outputs(), OCP(30, [1.0, 0.0], [0.0], [0.1], [-5.0], [5.0])) is None
 

@@ -31,11 +31,12 @@ size, that counts as steady."""
 def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance, ...] | None:
     """Default disturbance model; None: one disturbance at each input.
 
-    Disturbances of controlled outputs act at the inputs. If errors of the parameters require disturbances larger than
-    the inputs' ranges, they act on the rates of the states that the controlled outputs measure. An output
-    without weight has a disturbance of its own if errors of the parameters move it in a way that no load at an input
-    explains; otherwise the controlled outputs would have an offset. There are never more disturbances than outputs,
-    since more are not observable. A problem with references of states has one disturbance at each input.
+    Disturbances of controlled outputs act at the inputs, and an output without weight has a disturbance of its own if
+    errors of the parameters move it in a way that no load at an input explains; otherwise the controlled outputs would
+    have an offset. If errors of the parameters require disturbances larger than the inputs' ranges, they act instead on
+    the rates of the states that the outputs measure, or only of those of the controlled outputs if not every output
+    measures a state of its own. There are never more disturbances than outputs, since more are not observable. A
+    problem with references of states has one disturbance at each input.
 
     Args:
         model: The fitted prior.
@@ -73,9 +74,10 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     best = min(found, key=lambda one: needed(one, control), default=None)
     if best is not None and needed(best, control) <= CARRIES:
         return _plain(best)
-    others = _with_rates(model, control, held, sizes)
-    if others is not None and offset_free(others).detectable:
-        return others.disturbance_model
+    for outputs in (range(model.n_y), held):
+        others = _with_rates(model, control, outputs, sizes)
+        if others is not None and offset_free(others).detectable:
+            return others.disturbance_model
     return None if best is None else _plain(best)
 
 
