@@ -90,9 +90,9 @@ def monitor(
         with make_progress() as progress:
             found = learn_job(job, learn, out, progress)
         rate = two_digits(found.false_alarms_per_hour)
-        line = f"learned from {60 * found.hours:.1f} min for {rate} false alarms per hour"
+        line = f"learned from {two_digits(60 * found.hours)} min for {rate} false alarms per hour"
         if not found.rated:
-            line = f"learned from {60 * found.hours:.1f} min: {found.method}"
+            line = f"learned from {two_digits(60 * found.hours)} min: {found.method}"
         print_summary([line], out / "calibration.json", "limits")
         return
     say(watching(job))
@@ -115,7 +115,7 @@ def watching(job: MonitorJob) -> str:
     channels = ", ".join(dict.fromkeys(one.channel for one in limits.channels))
     return (
         f"channels: {channels}; limits for {two_digits(limits.false_alarms_per_hour)} false alarms per hour, learned "
-        f"from {60 * limits.hours:.1f} min: {limits.method}"
+        f"from {two_digits(60 * limits.hours)} min: {limits.method}"
     )
 
 

@@ -247,7 +247,7 @@ def watch_lines(found: WatchResult | Absent) -> list[str]:
         >>> row = FaultedLoop("weak_pump", "the pump weakens", "levels", 450.0, None, (), "", 1)
         >>> watch = WatchResult({"hybrid": WatchFile({"residuals": limits})}, "residuals", faults=(row,))
         >>> print(*watch_lines(watch), sep="\n")
-        monitor of residuals: learned from 6.0 min for 2 false alarms per hour; 0 alarms on recordings
+        monitor of residuals: learned from 6 min for 2 false alarms per hour; 0 alarms on recordings
           weak_pump: not detected (alarms before the fault: 1)
     """
     from hybrid_mpc.workflow.stage import Absent
@@ -259,7 +259,7 @@ def watch_lines(found: WatchResult | Absent) -> list[str]:
     if not limits.rated:
         rate = "too short to guarantee a false alarm rate"
     lines = [
-        f"monitor of {found.kind}: learned from {60 * limits.hours:.1f} min {rate}; "
+        f"monitor of {found.kind}: learned from {two_digits(60 * limits.hours)} min {rate}; "
         f"{counted(len(found.alarms), 'alarm')} on recordings"
     ]
     for row in found.faults or ():

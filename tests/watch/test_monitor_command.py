@@ -80,7 +80,7 @@ def test_the_kit_s_own_limits_need_no_option(folder, noisy_artifact, tmp_path):
     set_limits(model, {"hybrid": [limits]})
     done = command(folder, model, tmp_path / "out")
     assert done.exit_code == 0, done.output
-    told = "channels: force of phi, power of the free run; limits for 2 false alarms per hour, learned from 3.0 min"
+    told = "channels: force of phi, power of the free run; limits for 2 false alarms per hour, learned from 3 min"
     assert told in done.output
     found = json.loads((tmp_path / "out" / "monitor.json").read_text())
     assert found["limits"]["data_hash"] == limits.data_hash
