@@ -1019,7 +1019,12 @@ def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
         ]
         gains = [ours / theirs for ours, theirs in errors if theirs > 0]
     gain, names = float(np.exp(np.mean(np.log(gains)))), ", ".join(states[i].name for i in places)
-    what = f"constant loads at the rates of {names}, each the effect of a parameter {100 * OFF:.0f} % off"
+    what = (
+        f"constant loads at the rates of {names}"
+        if len(places) > 1
+        else f"a constant load at the rate of {names}"
+    )
+    what += f" with the effect of a parameter {100 * OFF:.0f} % off"
     where = f"in loops of {n * point.model.dt:.3g} s on the model itself, {point.title}"
     if not off and gain < GAINS:
         return Promise(name, "shown", f"{what}, leave no offset {where}")

@@ -23,6 +23,9 @@ NEARLY = 0.05
 """Largest change of a parameter, and largest standard error, over its nominal value, that confirm the nominal value."""
 LATE = 4.0
 """Longest delay of the inputs [model periods] that is tested if no delay is fitted."""
+SHORT = 2.0
+"""Length of short free runs, in the longest tested delays. Over many time constants a short delay hardly matters, but a
+controller answers within few periods."""
 SHORTEST = 0.01
 """Shortest delay that causes a warning [periods]. With noise-free data only the integration error remains, most of
 which a delay of 4e-5 periods can explain."""
@@ -78,25 +81,25 @@ def late_inputs(
     """A warning if a delay of the inputs explains the first part, and every other part that is long enough, better than
     the parameters alone; both are fitted to the same windows of the first part.
     """
-    late = fit.with_delay(LATE * fit.dt)
-    problems: list[Shooting] = []
-    for part in parts:
-        if (longest := min(periods, most_samples(part) - late.lead - 1)) >= 2:
-            windows = cut_outputs(
-                part, longest, late.lead, FEW, fit.prior.states, fit.prior.outputs, first_states
+    late, short = fit.with_delay(LATE * fit.dt), round(SHORT * LATE)
+    for most in (periods, short) if periods > 2 * short else (periods,):
+        problems: list[Shooting] = []
+        for part in parts:
+            if (longest := min(most, most_samples(part) - late.lead - 1)) >= 2:
+                windows = cut_outputs(
+                    part, longest, late.lead, FEW, fit.prior.states, fit.prior.outputs, first_states
+                )
+                problems.append(Shooting(late, windows, sizes))
+            elif not problems:
+                return ()
+        found = fitted_delay(fit, theta, problems)
+        if found is not None and found.surely:
+            ratios = " and ".join(f"{ratio:.2f}" for ratio in found.ratios)
+            return (
+                f"{found}: such a delay would reduce the errors over {longest} periods of training and validation "
+                f"recordings by the factors {ratios}. {ADD_DELAY} [HM-IDENTIFY-080]",
             )
-            problems.append(Shooting(late, windows, sizes))
-        elif not problems:
-            return ()
-    found = fitted_delay(fit, theta, problems)
-    return (
-        ()
-        if found is None or not found.surely
-        else (
-            f"{found}: such a delay would reduce the errors over training and validation recordings by the factors "
-            f"{' and '.join(f'{ratio:.2f}' for ratio in found.ratios)}. {ADD_DELAY} [HM-IDENTIFY-080]",
-        )
-    )
+    return ()
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulated_pendulum import DT, TRUTH, Pendulum, record
 
-from hybrid_mpc import fit_prior
+from hybrid_mpc import Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.delay import delayed, lost_samples
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import Simulation
@@ -59,6 +59,37 @@ def test_late_inputs_are_told_where_all_recordings_show_them():
     assert late_told(late[:2], [late[2].part(slice(0, 6))])  # too short to tell
     assert not late_told(late[:2], others[2:])
     assert not late_told(noisy[:2], noisy[2:])
+
+
+class Lag(Prior):
+    """A lag of a second."""
+
+    states = outputs = (Signal("speed", "-", -9.0, 9.0),)
+    inputs = (Signal("u", "-"),)
+    parameters = (Parameter("gain", 1.0, "-", 0.2, 5.0), Parameter("tau", 1.0, "s", 0.2, 5.0))
+
+    def xdot(self, x, u, w, p):
+        """First order."""
+        return ((p.gain * u.u - x.speed) / p.tau,)
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_short_free_runs_show_a_delay_that_a_load_hides_in_long_ones(late):
+    """A slow load causes most of the error over 200 periods; over eight periods the delay does."""
+    dt, n, runs = 0.02, 3000, []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        u, a = np.repeat(rng.uniform(-1.0, 1.0, n // 5), 5), np.exp(-dt / 1.0)
+        load, x = 0.2 * np.sin(2 * np.pi * dt * np.arange(n) / (5.0 + seed)), np.zeros(n)
+        for k in range(n - 1):
+            x[k + 1] = a * x[k] + (1 - a) * (u[max(0, k - late)] + load[k])
+        nothing = np.full((n, 1), np.nan)
+        y = (x + 1e-3 * rng.standard_normal(n))[:, None]
+        runs.append(Trajectory(f"r{seed}", "train", dt, dt * np.arange(n), u[:, None], y, nothing, nothing))
+    warnings = fit_prior(Lag, runs[:1], runs[1:], dt=dt, length=200 * dt).warnings
+    told = [one for one in warnings if "HM-IDENTIFY-080" in one]
+    assert len(told) == late
+    assert not told or "8 periods" in told[0]
 
 
 @pytest.mark.full
