@@ -382,7 +382,7 @@ def _free_run_tables(context: Context) -> list[Table]:
     for name, one in errors.items():
         rmse, fit = ([_by(by, label) for label in outputs] for by in (one.rmse, one.fit_percent))
         rows.append((name, finite(one.error), _percent(one.error, base), *rmse, *fit))
-    columns = ("model", "error [-]", "ratio to prior", *(f"RMSE of {label}" for label in outputs),
+    columns = ("model", "error [-]", "change from prior", *(f"RMSE of {label}" for label in outputs),
                *(f"FIT of {s.name} [%]" for s in prior.outputs))  # fmt: skip
     length = context.prior.longest_run
     of = "" if length is None else f" of {length:.3g} s"
@@ -396,7 +396,7 @@ def _free_run_tables(context: Context) -> list[Table]:
     columns = (
         "model",
         "E_sim [-]",
-        "ratio to prior",
+        "change from prior",
         *(f"violation of {label}" for label in balances),
     )
     caption = "Free runs on test data: rates of the states" + (" and balances." if balances else ".")
