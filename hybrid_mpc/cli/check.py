@@ -138,13 +138,9 @@ def _fit(console: Console, context: Context) -> tuple[tuple[str, ...], ...]:
     console.print(_free_runs(prior, found))
     fitted = found.errors["phy"].error
     better = [n for n, one in found.baselines.items() if one.errors is not None and one.errors.error < fitted]
-    why = (
-        "A physical term may be missing"
-        if found.lacking
-        else f"{better[0]} predicts better"
-        if better
-        else ""
-    )
+    why = f"{better[0]} predicts better" if better else ""
+    if found.lacking:
+        why = "A physical term may be missing"
     return stops(found, cause=False), found.fit.warnings, found.in_doubt, (why,) if why else ()
 
 

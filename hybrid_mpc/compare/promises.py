@@ -58,17 +58,45 @@ RESTS = 5.0
 """Largest scatter of a settled output, in standard deviations of its sensor. The sensor noise alone makes 1. Noise that
 the observer passes on to the input adds to it, in an unstable machine several times as much."""
 SLOW = "the observer is slow"
+AT_ITS_LIMIT = "is at its limit"
+UNREACHED = "the set-point cannot be reached within the limits"
+UNMOVED = "the estimated disturbance does not change: the observer explains every load by its process noise"
+RESTLESS = "the loop does not settle: noise or friction excites it"
+PULLED = "the weight r pulls the input towards the operating point; set r = 0 and weight changes by r_delta"
+BESIDE = "the machine stands still beside its set-point, as with dry friction"
 """Begin of the reason of a loop whose observer estimates the load, but not within the trial."""
+REMEDIES = (
+    (
+        (AT_ITS_LIMIT, UNREACHED),
+        "Choose set-points farther from the limits of the inputs, or use a stronger actuator.",
+    ),
+    (
+        (SLOW, UNMOVED),
+        "Reduce the process noise (Scenario(state_noise=...)), or improve the prior's one-step prediction; see the "
+        "rows on the observer.",
+    ),
+    ((PULLED,), "Set r = 0."),
+    (
+        (RESTLESS, BESIDE),
+        "Model the friction in the prior (docs/disturbances.md#dry-friction), or reduce it in the machine.",
+    ),
+)
+"""Remedies for an offset, by its reasons."""
+ELSE = (
+    "Declare a disturbance where the error enters (Scenario(disturbance_model=...)). Look at friction, and at the "
+    "task's loops in the report."
+)
+"""Remedy for an offset of unknown reason."""
 STILL_MOVES = 0.02
 """Change of the estimated load within the end of a trial, over the load, above which the estimate has not settled."""
 STANDS = 0.2
 """Standard deviation of a true output, over that of its sensor noise, below which the output stands still."""
 CONSTANTS = 3
 """Time constants of the observer after which a load counts as estimated: exp(-3) = 5 % is left."""
+DIVERGED = 1e12
+"""Mean squared error of a loop that diverges."""
 GAINS = 1.5
 """Ratio of squared errors from which on disturbances at rates are recommended for loads elsewhere."""
-LIMITED = ("is at its limit", "within the limits")
-"""Ends of the reasons of an offset that a limit of the inputs causes."""
 ROUNDING = 1e-6
 """Part of a unit load at the rate of a state that the disturbances do not represent, from which on it counts."""
 AT_LIMIT = 1e-3
@@ -267,7 +295,7 @@ class Trial:
     @property
     def limited(self) -> bool:
         """Whether a limit of the inputs causes the deviations."""
-        return self.why.endswith(LIMITED)
+        return AT_ITS_LIMIT in self.why or UNREACHED in self.why
 
 
 @dataclass(frozen=True)
@@ -580,28 +608,26 @@ def _explain_offset(point: SetPoint, result: ClosedLoopResult, errors: Array) ->
     edge = AT_LIMIT * problem.input_range
     at = np.mean((result.u[late] >= problem.u_max - edge) | (result.u[late] <= problem.u_min + edge), axis=0)
     if at.max() > 0.5:
-        return f"{model.inputs[int(at.argmax())].name} is at its limit"
+        return f"{model.inputs[int(at.argmax())].name} {AT_ITS_LIMIT}"
     if result.reached.size and not np.all(result.reached[late]):
-        return "the set-point cannot be reached within the limits"
+        return UNREACHED
     periods = periods_to_find(quiet(point.estimator), SEARCHED * problem.horizon)
     slowest = float(np.max(np.where(np.isnan(periods), np.inf, periods)))
     if not math.isfinite(slowest):
-        return (
-            "the estimated disturbance does not change: the observer explains every load by its process noise"
-        )
+        return UNMOVED
     found = deviations(model.outputs, point.held, point.sigma, errors)
     if all(abs(one.offset) <= NOISE * one.sigma for one in found):
-        return "the loop does not settle: noise or friction excites it"
+        return RESTLESS
     half = (len(errors) - late.start) // 2
     d, sizes = result.d[late], LOAD * disturbance_sizes(model, problem)
     moved = np.abs(d[half:].mean(axis=0) - d[:half].mean(axis=0)) / sizes
     if moved.max() > STILL_MOVES or CONSTANTS * slowest > len(errors):
         return f"{SLOW}: after {len(errors) * model.dt:.3g} s its estimate of the load has not settled"
     if not problem.n_y and np.any(problem.r > 0) and np.any(np.abs(point.rest[1] - model.u0) > edge):
-        return "the weight r pulls the input towards the operating point; set r = 0 and weight changes by r_delta"
+        return PULLED
     true = np.array([model.output(x, model.u0, point.w, model.p).full().ravel() for x in result.x[late]])
     if all(float(np.std(true[:, one])) < STANDS * point.sigma[one] for one in point.held):
-        return "the machine stands still beside its set-point, as with dry friction"
+        return BESIDE
     return "no disturbance of the model explains the error"
 
 
@@ -668,21 +694,7 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
 
 def choose_remedy(why: str) -> str:
     """Remedy for an offset, by its reason."""
-    if "limit" in why:
-        return "Choose set-points farther from the limits of the inputs, or use a stronger actuator."
-    if "slow" in why or "does not move" in why:
-        return (
-            "Reduce the process noise (Scenario(state_noise=...)), or improve the prior's one-step prediction; see the "
-            "rows on the observer."
-        )
-    if "weight r" in why:
-        return "Set r = 0."
-    if "friction" in why:
-        return "Model the friction in the prior (docs/disturbances.md#dry-friction), or reduce it in the machine."
-    return (
-        "Declare a disturbance where the error enters (Scenario(disturbance_model=...)). Look at friction, and at the "
-        "task's loops in the report."
-    )
+    return next((remedy for reasons, remedy in REMEDIES if any(one in why for one in reasons)), ELSE)
 
 
 # Step time.
@@ -1010,20 +1022,16 @@ def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
     trials = {i: _load_rate(point, i, load) for i, load in places.items()}
     off = {i: one for i, one in trials.items() if one.why and not one.limited}
     rates = rates_of_outputs(point.model, point.problem)
+    other = None if rates is None else _with_disturbances(kit, point, rates)
     gains = [1.0]
-    if rates is not None:
-        other = _with_disturbances(kit, point, rates)
-        errors = [
-            (_mean_square(point, trials[i]), _mean_square(other, _load_rate(other, i, places[i])))
-            for i in places
+    if other is not None:
+        gains = [
+            _mean_square(point, trials[i]) / _mean_square(other, _load_rate(other, i, load))
+            for i, load in places.items()
         ]
-        gains = [ours / theirs for ours, theirs in errors if theirs > 0]
     gain, names = float(np.exp(np.mean(np.log(gains)))), ", ".join(states[i].name for i in places)
-    what = (
-        f"constant loads at the rates of {names}"
-        if len(places) > 1
-        else f"a constant load at the rate of {names}"
-    )
+    many = len(places) > 1
+    what = f"{'constant loads at the rates' if many else 'a constant load at the rate'} of {names}"
     what += f" with the effect of a parameter {100 * OFF:.0f} % off"
     where = f"in loops of {n * point.model.dt:.3g} s on the model itself, {point.title}"
     if not off and gain < GAINS:
@@ -1044,12 +1052,15 @@ def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
     return Promise(name, "doubted", f"{evidence}, {where}", remedy)
 
 
-def _with_disturbances(kit: Kit, point: SetPoint, chosen: tuple[Disturbance, ...]) -> SetPoint:
-    """The same set-point with another disturbance model."""
+def _with_disturbances(kit: Kit, point: SetPoint, chosen: tuple[Disturbance, ...]) -> SetPoint | None:
+    """The same set-point with another disturbance model; None if the kit's noise makes no observer of it."""
     of = kit.with_disturbances(chosen)
     task = next((name for name in point.tasks[:1] if name in kit.loop.control), "")
-    model, controller = of.models[of.recommended], of.controller(task=task)
-    return replace(point, model=model, controller=controller, estimator=of.observer(task=task))
+    try:
+        controller, estimator = of.controller(task=task), of.observer(task=task)
+    except InputError:  # e.g. the process noise hides a disturbance
+        return None
+    return replace(point, model=of.models[of.recommended], controller=controller, estimator=estimator)
 
 
 def _find_unrepresented(point: SetPoint) -> dict[int, float]:
@@ -1074,10 +1085,13 @@ def _load_rate(point: SetPoint, i: int, load: float) -> Trial:
 
 
 def _mean_square(point: SetPoint, one: Trial) -> float:
-    """Mean squared error of the controlled outputs, over their noise."""
+    """Mean squared error of the controlled outputs, over their noise; at most 1e12, also of a loop that diverges."""
     before = np.vstack([one.result.u[:1], one.result.u[:-1]])
     errors = point.errors(one.result.y, before)[:, point.held] / point.sigma[point.held]
-    return float(np.nanmean(errors**2))
+    known = np.abs(errors[~np.isnan(errors)])
+    if one.fails or not known.size:
+        return DIVERGED
+    return float(np.clip(np.mean(np.minimum(known, DIVERGED) ** 2), 1.0 / DIVERGED, DIVERGED))
 
 
 def _name_disturbance(model: HybridModel, j: int) -> str:

@@ -656,8 +656,8 @@ class _Explain:
                 break
             self._add(chosen, scored, trials)
             self._remove()
-            on_step(self._told("the search was stopped", ()))
-        return self._told(reason, last)
+            on_step(self._explanation("the search was stopped", ()))
+        return self._explanation(reason, last)
 
     def _resume(self, begun: Explanation) -> None:
         terms = begun.terms(self.own)
@@ -877,7 +877,7 @@ class _Explain:
     def _error(self, squares: Array) -> float:
         return float(np.sqrt(squares[self.evidence.counted].mean()))
 
-    def _told(self, reason: str, last: tuple[Trial, ...]) -> Explanation:
+    def _explanation(self, reason: str, last: tuple[Trial, ...]) -> Explanation:
         terms = self.now.terms
         parameters = self._parameters(terms, self.now.theta)
         there = {term.name: term for term in terms}

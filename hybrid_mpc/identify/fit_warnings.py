@@ -93,7 +93,7 @@ def late_inputs(
             elif not problems:
                 return ()
         found = fitted_delay(fit, theta, problems)
-        if found is not None and found.surely:
+        if found is not None and found.significant:
             ratios = " and ".join(f"{ratio:.2f}" for ratio in found.ratios)
             return (
                 f"{found}: such a delay would reduce the errors over {longest} periods of training and validation "
@@ -119,7 +119,7 @@ class FittedDelay:
     longest: bool
 
     @property
-    def surely(self) -> bool:
+    def significant(self) -> bool:
         """Whether the delay is distinct from zero and reduces the error of every part."""
         return max(self.ratios) < TELLING and self.delay > 2.0 * self.error
 

@@ -139,13 +139,13 @@ def fit_each(
         thetas.append(own.values(alone))
         if delay:
             delays.append(fitted_delay(every, every.scaled(thetas[-1]), [Shooting(late, windows, sizes)]))
-    surely = [one for one in delays if one is not None and one.surely]
+    significant = [one for one in delays if one is not None and one.significant]
     return OwnFits(
         tuple(f"block {i}" if varying.blocks else part[0].file for i, part in enumerate(pieces, 1)),
         varying,
         {name: tuple(theta[name] for theta in thetas) for name in varying.names},
         math.sqrt(float(squares[1] / max(squares[0], 1e-300))),
-        tuple(surely) if len(surely) == len(pieces) else (),
+        tuple(significant) if len(significant) == len(pieces) else (),
     )
 
 

@@ -74,10 +74,9 @@ def default_disturbances(model: HybridModel, control: OCP) -> tuple[Disturbance,
     best = min(found, key=lambda one: needed(one, control), default=None)
     if best is not None and needed(best, control) <= CARRIES:
         return _plain(best)
-    for outputs in (range(model.n_y), held):
-        others = _with_rates(model, control, outputs, sizes)
-        if others is not None and offset_free(others).detectable:
-            return others.disturbance_model
+    others = rates_of_outputs(model, control) or _rates(model, control, held)
+    if others is not None:
+        return others
     return None if best is None else _plain(best)
 
 
@@ -88,8 +87,7 @@ def rates_of_outputs(model: HybridModel, control: OCP) -> tuple[Disturbance, ...
     Its size is the effect of parameter errors of :data:`OFF`, or what moves the state by its size within half a
     horizon if that is more. Example: ``replace(model, disturbance_model=rates_of_outputs(model, control))``.
     """
-    found = _with_rates(model, control, range(model.n_y), Sizes(model, control))
-    return found.disturbance_model if found is not None and offset_free(found).detectable else None
+    return _rates(model, control, range(model.n_y))
 
 
 def loads_by_parameters(model: HybridModel, control: OCP) -> Array:
@@ -118,11 +116,12 @@ def _with_inputs(model: HybridModel, places: tuple[int, ...], own: list[Disturba
     return replace(model, disturbance_model=chosen)
 
 
-def _with_rates(model: HybridModel, control: OCP, held: Sequence[int], sizes: Sizes) -> HybridModel | None:
-    """The model with disturbances of the rates of the states that outputs ``held`` measure (for positions: of their
-    speeds), and of the other outputs; None if an output does not depend on exactly one state.
+def _rates(model: HybridModel, control: OCP, held: Sequence[int]) -> tuple[Disturbance, ...] | None:
+    """Disturbances of the rates of the states that outputs ``held`` measure (for positions: of their speeds), and of
+    the other outputs; None if they are not detectable, or if one of ``held`` depends on several states.
     """
     rows = output_with_jacobian(model)(model.x0, model.u0, model.w)[1].full()
+    sizes = Sizes(model, control)
     # a disturbance of a rate moves the state by the state's size within half a horizon, or as errors of parameters do
     speeds, found = kinematics(model), [sizes.states / (0.5 * control.horizon * model.dt)]
     found += [np.sqrt(np.sum(off**2, axis=1)) / model.dt for off in _off_rates(model, control)]
@@ -139,7 +138,8 @@ def _with_rates(model: HybridModel, control: OCP, held: Sequence[int], sizes: Si
         chosen.append(Disturbance("rate", model.states[place].name, float(rates[place])))
     if len({(d.at, d.signal) for d in chosen}) < len(chosen):
         return None
-    return replace(model, disturbance_model=tuple(chosen))
+    disturbed = replace(model, disturbance_model=tuple(chosen))
+    return disturbed.disturbance_model if offset_free(disturbed).detectable else None
 
 
 def needed(model: HybridModel, control: OCP) -> float:

@@ -152,7 +152,8 @@ def test_a_disturbance_model_without_steps_does_not_move():
     row = p.disturbance_model([broken], trials[:1])
     assert (row.verdict, "gain on it is zero" in row.evidence) == ("not promised", True)
     row = p.no_offset(broken, trials)
-    assert (row.verdict, "does not change" in row.evidence) == ("doubted", True)
+    assert (row.verdict, p.UNMOVED in row.evidence) == ("doubted", True)
+    assert "process noise" in row.remedy
 
 
 def test_ranks_that_lack_and_economic_costs_promise_nothing():
@@ -239,6 +240,17 @@ def test_loads_at_other_states_are_doubted_if_rates_reject_them_better():
     assert found == pytest.approx(times, rel=0.1)
     assert found < 1.0 / p.GAINS
     assert p.loads_elsewhere(other, better) is None
+
+
+def test_rates_that_the_noise_hides_are_no_remedy():
+    """With process noise that explains every load no observer is possible; nothing is raised."""
+    chosen = (Disturbance("input", "valve"),)
+    kit = kit_of(two_tanks(disturbance_model=chosen), TANKS)
+    (point,) = p.set_points(kit, [])
+    row = p.loads_elsewhere(kit.with_noise({"prior_observer": (1e4, 1e4)}), point)
+    assert row.verdict == "doubted"
+    assert "leaves lower offset" in row.evidence
+    assert "disturbance_model" not in row.remedy
 
 
 def test_loads_that_the_disturbances_represent_have_no_row(good):
