@@ -42,6 +42,7 @@ from hybrid_mpc.workflow.stages.export import ExportResult
 from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
 from hybrid_mpc.workflow.stages.identify import DATA, DataResult, models_of, trained_kinds, training_settings
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
+from hybrid_mpc.workflow.stages.promises import found_terms
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect
 from hybrid_mpc.workflow.stages.track import TrackResult
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
@@ -191,7 +192,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         (),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
-        advice(results, explained=_explained(context), declared=context.scenario.sensor_sigma),
+        advice(results, explained=found_terms(context) is not None, declared=context.scenario.sensor_sigma),
         doubt_of(results.prior.in_doubt),
         answer_all(results),
     )
