@@ -186,6 +186,8 @@ class Scenario:
         terms: Candidates of ``hybrid-mpc explain``: names of laws of :mod:`hybrid_mpc.machine.terms`, e.g.
             ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Default, if no law is named: all
             laws, besides the own terms.
+        explained: Whether ``hybrid-mpc explain`` has searched for terms that the prior lacks, as in the files that it
+            writes. Default: no.
         choice: How sure held-out data must show that a hybrid is better than the fitted prior. Default: 95 %.
         false_alarms_per_hour: Wanted rates of the monitor's false alarms [1/h], in rising order; limits are learned for
             the first rate that the undisturbed data are long enough for. A machine that stops at an alarm needs lower
@@ -222,6 +224,7 @@ class Scenario:
     beyond_recordings: bool = False
     disturbance_model: tuple[Disturbance, ...] | None = None
     terms: tuple[Term | Name, ...] = ()
+    explained: bool = False
     choice: ChoiceRule = field(default_factory=ChoiceRule)
     false_alarms_per_hour: tuple[Positive, ...] = ()
 

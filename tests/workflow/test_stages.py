@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, RunSettings, load, load_scenario
+from hybrid_mpc.cli.run import run
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.workflow import run as job
 from hybrid_mpc.workflow import stage as stages
@@ -423,6 +424,11 @@ def test_loops_read_tasks_by_what_they_say(tmp_path):
     other = keys(reference=lambda t: np.zeros((len(t), 2)))
     assert [key for key in same if same[key] != other[key]] == [f"task {name}"]
     assert keys(figures=eval("lambda result: {}"))[f"task {name}"] == ""
+
+
+def test_the_help_of_run_names_every_stage():
+    names = run.__doc__.partition("The stages are ")[2].partition(". ")[0]
+    assert tuple(re.split(r",\s+|\s+and\s+", names)) == NAMES
 
 
 def test_changes_are_named():

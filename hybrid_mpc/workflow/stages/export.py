@@ -31,7 +31,7 @@ from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.choose import CHOICE
-from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, trained_models
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, UNTRAINED, trained_models
 from hybrid_mpc.workflow.stages.track import TRACK
 
 FEW = 10
@@ -79,7 +79,8 @@ def export_stage(context: Context) -> ExportResult:
     """Write hybrid, fitted prior and each network of the hybrid as one artifact; compare all of them with torch."""
     dt, settings, prior, chosen = context.spec.dt, context.settings, context.prior, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
-    trained = trained_models(context, chosen.deployed).shrunk(phy, chosen.choice.share(chosen.deployed))
+    kind = UNTRAINED if chosen.deployed == "phy" else chosen.deployed
+    trained = trained_models(context, kind).shrunk(phy, chosen.choice.share(kind))
     alone = trained.steps(phy, dt)[:MOST_MEMBERS] if len(trained.validation) > 1 else []
     members = member_names(len(alone))
     steps: dict[str, RecurrentStep | PriorStep] = {
