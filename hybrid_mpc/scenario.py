@@ -123,7 +123,8 @@ class Budget(BenchmarkBudget):
 
     Args:
         seeds: Most closed loops per task and controller; fewer if they suffice to distinguish the controllers' costs.
-        oracle_seeds: Most closed loops per task of the oracles, which are slow; never more than of the others.
+        oracle_seeds: Most closed loops per task of the oracles, which are slow; never more than of the others. Default:
+            none, because a single loop has no interval.
         tasks: Names of the tasks to run. Default: all.
 
     Example:
@@ -132,7 +133,7 @@ class Budget(BenchmarkBudget):
     """
 
     seeds: Count
-    oracle_seeds: CountOrNone = 1
+    oracle_seeds: CountOrNone = 0
     tasks: tuple[Name, ...] | None = None
 
 

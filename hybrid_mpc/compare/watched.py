@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.compare.loops import LoopSpec, ModeChange, bench_of
 from hybrid_mpc.kit.artifact import Kit, load
 from hybrid_mpc.kit.parts import artifact_digest
+from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.watch.explain import begun, explained
 from hybrid_mpc.watch.monitor import Monitor, make_readings
 from hybrid_mpc.watch.readings import Readings
@@ -23,12 +24,13 @@ Report = Callable[[int, int, str], None]
 
 
 def traces_of(
-    folder: Path, name: str, kinds: Sequence[str], rest: tuple[float, ...] | None, record: TrajectoryLike,
-    report: Report,
+    scenario: str, folder: Path, name: str, kinds: Sequence[str], rest: tuple[float, ...] | None,
+    record: TrajectoryLike, report: Report,
 ) -> dict[str, Trace]:  # fmt: skip
     """Traces of a model's monitors without limits over a record, by kind of reading; one estimator serves all kinds.
 
     Args:
+        scenario: Registered name or file of the scenario.
         folder: Folder of the artifact.
         name: Name of the model.
         kinds: Kinds of readings, see :func:`~hybrid_mpc.watch.monitor.make_readings`.
@@ -36,7 +38,7 @@ def traces_of(
         record: See :func:`~hybrid_mpc.watch.replay.replay`.
         report: Called with ``(done, total, text)``, counted in samples.
     """
-    kit, text = _kit_of(folder, artifact_digest(folder)), f"samples, {getattr(record, 'name', '')}"
+    kit, text = _kit_of(scenario, folder, artifact_digest(folder)), f"samples, {getattr(record, 'name', '')}"
     monitors = [Monitor(readings_of(kit, name, kind, rest)) for kind in kinds]
     found = replays(
         monitors, kit.observer(name), record, on_progress=lambda done, total: report(done, total, text)
@@ -55,8 +57,8 @@ def readings_of(kit: Kit, name: str, kind: str, rest: tuple[float, ...] | None) 
 
 
 @lru_cache(maxsize=1)
-def _kit_of(folder: Path, content: str) -> Kit:
-    return load(folder)
+def _kit_of(scenario: str, folder: Path, content: str) -> Kit:
+    return load(folder).on(load_scenario(scenario))
 
 
 @dataclass(frozen=True)

@@ -174,13 +174,13 @@ def _library() -> Markup:
 
 
 def words(
-    file: str, networks: Collection[str] = ("rnn", "pgrnn", "mopgrnn")
+    file: str, models: Collection[str] = ("rnn", "pgrnn", "mopgrnn", "oracle")
 ) -> dict[str, tuple[Markup, ...]]:
     """General texts of a page's sections, from a template with one block for each section.
 
     Args:
         file: Name of the template.
-        networks: Kinds of networks that the page describes. Default: all.
+        models: Kinds of networks that the page describes, and ``"oracle"``. Default: all.
 
     Example:
         >>> len(words("run_words.html")["training"])
@@ -188,7 +188,7 @@ def words(
     """
     template, texts = _template(file), {}
     for name, block in template.blocks.items():  # type: ignore[attr-defined]
-        paragraphs = "".join(block(template.new_context({"networks": networks}))).split("\n\n")
+        paragraphs = "".join(block(template.new_context({"models": models}))).split("\n\n")
         texts[name] = tuple(Markup(" ".join(paragraph.split())) for paragraph in paragraphs)
     return texts
 

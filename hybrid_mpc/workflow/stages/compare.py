@@ -131,6 +131,11 @@ class ControlResult(ClosedLoops):
             return float(np.mean(known)), ""
         return None, "; ".join(dict.fromkeys(reason for _, reason in self.gaps.values())) or self.reason
 
+    @property
+    def has_oracle(self) -> bool:
+        """Whether an oracle ran."""
+        return any(row.controller in ORACLES for row in self.rows)
+
     def cost(self, controller: str) -> float | None:
         """Sum over the tasks of a controller's mean costs; None without loops, or if one diverged."""
         own = [cells[controller].cost.mean for cells in self.means.values() if controller in cells]
@@ -222,7 +227,7 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     gap closed = (J_baseline - J_hybrid) / (J_baseline - J_oracle), with mean costs J over the seeds.
     """
     if "oracle" not in cells:
-        return None, "the scenario has no oracle"
+        return None, "no oracle ran"
     costs = {name: np.array([row.cost for row in rows]) for name, rows in cells.items()}
     baseline = min((costs[n] for n in BASELINES if n in costs), key=lambda c: float(c.mean()))
     hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]

@@ -159,7 +159,8 @@ def noise_stage(context: Context) -> NoiseResult | Absent:
         put_noise(context, NoiseResult({}, of, context.scenario.disturbance_model))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     kit = context.kit
-    found = noise_of(context.scenario, kit, context.commanded("train"))
+    scenario = context.scenario if context.budget.oracle_seeds else replace(context.scenario, oracle=None)
+    found = noise_of(scenario, kit, context.commanded("train"))
     noise = {name: tuple(sigma.tolist()) for name, sigma in found.items()}
     result = NoiseResult(noise, of, kit.loop.disturbance_model)
     put_noise(context, result)
@@ -203,7 +204,7 @@ def observed(context: Context) -> dict[str, object]:
         "beyond recordings": scenario.beyond_recordings,
         "disturbance model": scenario.disturbance_model,
         "weights of outputs or horizon": None if control is None else (control.q_y, control.horizon),
-        "oracle": source_of(scenario.oracle),
+        "oracle": source_of(scenario.oracle) if context.budget.oracle_seeds else None,
     }
 
 

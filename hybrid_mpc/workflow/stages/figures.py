@@ -259,8 +259,10 @@ def _overview(context: Context) -> Any:
         task: {name: (_number(cell.cost.mean), _number(cell.cost.ci95)) for name, cell in cells.items()}
         for task, cells in found.means.items()
     }
-    if any("oracle" in row for row in table.values()):
-        text = "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
+    if any(row.get(loops.BASELINE, (np.nan, np.nan))[0] > 0 for row in table.values()):
+        text = (
+            "Closed-loop cost of every controller over that of the prior with observer, with 95 % intervals."
+        )
         yield "control", "costs", loops.costs(table), text
     if scenario.figures is not None:
         for name, (figure, caption) in scenario.figures(found.rows).items():

@@ -171,7 +171,9 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         # without pictures and tables the general text of the section has nothing to explain
         if key in after and not figures.get(key) and not any(t.rows for t in tables.get(key, ())):
             instead[key] = after.pop(key)
-    texts = words("run_words.html", trained_kinds(context))
+    loops = closed_loops(results.control)
+    oracle = ("oracle",) if loops is not None and loops.has_oracle else ()
+    texts = words("run_words.html", (*trained_kinds(context), *oracle))
     sections = tuple(
         Section(
             TITLES[key],
@@ -213,7 +215,10 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if (loops := closed_loops(control)) is not None:
         value, reason = loops.gap
         undefined = f"The gap closed is not defined: {reason.rstrip('.')}."
-        after["control"] = (*((undefined,) if value is None else ()), *oracle_words(loops))
+        after["control"] = (
+            *((undefined,) if value is None and loops.has_oracle else ()),
+            *oracle_words(loops),
+        )
     else:
         timed = "" if isinstance(control, Absent) else " Instead, the controller was timed on recordings."
         if not isinstance(on_model, Absent) and on_model.plants:
@@ -460,18 +465,25 @@ def _export_table(export: ExportResult) -> Table:
 
 def _control_table(found: ControlResult) -> Table:
     names = [n for n in CONTROLLERS if any(n in cells for cells in found.means.values())]
+    gaps = found.gaps if found.gap[0] is not None else {}
     rows = []
     for task, cells in found.means.items():
-        gap, _ = found.gaps[task]
         costs = (_cost(cells.get(name)) for name in names)
-        rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
+        shares = ("–" if gap is None else f"{gap:.2f}" for gap in ([gaps[task][0]] if gaps else ()))
+        rows.append((task, *costs, *shares))
     caption = (
         "Closed-loop cost J on the true state: sum of the squared deviations of all signals, weighted as in the "
         "control problem. Mean over the seeds with a 95 % interval that holds with early stopping (no interval for "
-        "one seed). Gap closed: share of the distance from the better baseline to the measuring oracle that the "
-        "hybrid with observer covers; a dash if baseline and oracle do not differ significantly."
+        "one seed)."
     )
-    return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
+    if gaps:
+        caption += (
+            " Gap closed: share of the distance from the better baseline to the measuring oracle that the hybrid with "
+            "observer covers; a dash if baseline and oracle do not differ significantly."
+        )
+    return Table(
+        ("task", *(n.replace("_", ", ") for n in names), *(["gap closed"] if gaps else ())), rows, caption
+    )
 
 
 def _comparison_table(found: ControlResult) -> Table:

@@ -319,7 +319,10 @@ class Replays:
                 if own:
                     job = f"{name}, {getattr(record, 'name', len(jobs))}"
                     of[job] = name, id(record)
-                    jobs[job] = traces_of, (folder, name, own, self._rest, record)
+                    jobs[job] = (
+                        traces_of,
+                        (self._context.scenario_path, folder, name, own, self._rest, record),
+                    )
                     self._kept.append(record)
         found = run_jobs(
             jobs, self._context.progress.update, WORKERS, fresh=False, cluster=self._context.cluster
@@ -334,7 +337,8 @@ class Replays:
         return [self._traces[name, kind, id(record)] for record in records]
 
     def readings(self, name: str, kind: str) -> Readings:
-        """The readings of a kind; InputError if the model has none."""
+        """The readings of a kind; InputError if the model has none, or no estimator."""
+        self._kit.observer(name)
         return readings_of(self._kit, name, kind, self._rest)
 
     def _readable(self, name: str, kind: str) -> bool:
