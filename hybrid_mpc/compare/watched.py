@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.compare.loops import LoopSpec, ModeChange, bench_of
 from hybrid_mpc.kit.artifact import Kit, load
-from hybrid_mpc.kit.parts import artifact_digest
-from hybrid_mpc.scenario import load_scenario
+from hybrid_mpc.kit.parts import LoopSettings, artifact_digest
 from hybrid_mpc.watch.explain import begun, explained
 from hybrid_mpc.watch.monitor import Monitor, make_readings
 from hybrid_mpc.watch.readings import Readings
@@ -24,21 +23,22 @@ Report = Callable[[int, int, str], None]
 
 
 def traces_of(
-    scenario: str, folder: Path, name: str, kinds: Sequence[str], rest: tuple[float, ...] | None,
+    folder: Path, loop: LoopSettings, name: str, kinds: Sequence[str], rest: tuple[float, ...] | None,
     record: TrajectoryLike, report: Report,
 ) -> dict[str, Trace]:  # fmt: skip
     """Traces of a model's monitors without limits over a record, by kind of reading; one estimator serves all kinds.
 
     Args:
-        scenario: Registered name or file of the scenario.
         folder: Folder of the artifact.
+        loop: Settings of its loops.
         name: Name of the model.
         kinds: Kinds of readings, see :func:`~hybrid_mpc.watch.monitor.make_readings`.
         rest: Speeds below which friction may stick; None: unknown.
         record: See :func:`~hybrid_mpc.watch.replay.replay`.
         report: Called with ``(done, total, text)``, counted in samples.
     """
-    kit, text = _kit_of(scenario, folder, artifact_digest(folder)), f"samples, {getattr(record, 'name', '')}"
+    kit = replace(_kit_of(folder, artifact_digest(folder)), loop=loop)
+    text = f"samples, {getattr(record, 'name', '')}"
     monitors = [Monitor(readings_of(kit, name, kind, rest)) for kind in kinds]
     found = replays(
         monitors, kit.observer(name), record, on_progress=lambda done, total: report(done, total, text)
@@ -57,8 +57,8 @@ def readings_of(kit: Kit, name: str, kind: str, rest: tuple[float, ...] | None) 
 
 
 @lru_cache(maxsize=1)
-def _kit_of(scenario: str, folder: Path, content: str) -> Kit:
-    return load(folder).on(load_scenario(scenario))
+def _kit_of(folder: Path, content: str) -> Kit:
+    return load(folder)
 
 
 @dataclass(frozen=True)

@@ -440,7 +440,10 @@ def test_the_observer_s_stage_names_what_it_reads():
     """A horizon of its own is no change of weights alone."""
     scenario = load_scenario("golf_robot")
     longer = replace(scenario, control=scenario.control.changed(horizon=scenario.control.horizon + 1))
-    before, now = (observed(SimpleNamespace(scenario=one)) for one in (scenario, longer))
+    before, now = (
+        observed(SimpleNamespace(scenario=one, budget=scenario.budgets["quick"]))
+        for one in (scenario, longer)
+    )
     (label,) = [name for name in now if repr(now[name]) != repr(before[name])]
     assert "horizon" in label
     assert differing({label: "1"}, {label: "2"}) == f"changed: {label}"

@@ -319,10 +319,7 @@ class Replays:
                 if own:
                     job = f"{name}, {getattr(record, 'name', len(jobs))}"
                     of[job] = name, id(record)
-                    jobs[job] = (
-                        traces_of,
-                        (self._context.scenario_path, folder, name, own, self._rest, record),
-                    )
+                    jobs[job] = traces_of, (folder, self._kit.loop, name, own, self._rest, record)
                     self._kept.append(record)
         found = run_jobs(
             jobs, self._context.progress.update, WORKERS, fresh=False, cluster=self._context.cluster
