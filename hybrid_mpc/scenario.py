@@ -123,7 +123,8 @@ class Budget(BenchmarkBudget):
 
     Args:
         seeds: Most closed loops per task and controller; fewer if they suffice to distinguish the controllers' costs.
-        oracle_seeds: Most closed loops per task of the oracles, which are slow; never more than of the others.
+        oracle_seeds: Most closed loops per task of the oracles, which are slow; never more than of the others. Default:
+            none, because a single loop has no interval.
         tasks: Names of the tasks to run. Default: all.
 
     Example:
@@ -132,7 +133,7 @@ class Budget(BenchmarkBudget):
     """
 
     seeds: Count
-    oracle_seeds: CountOrNone = 1
+    oracle_seeds: CountOrNone = 0
     tasks: tuple[Name, ...] | None = None
 
 
@@ -186,6 +187,8 @@ class Scenario:
         terms: Candidates of ``hybrid-mpc explain``: names of laws of :mod:`hybrid_mpc.machine.terms`, e.g.
             ``"coulomb"``, and own terms (:class:`~hybrid_mpc.machine.terms.Term`). Default, if no law is named: all
             laws, besides the own terms.
+        explained: Whether ``hybrid-mpc explain`` has searched for terms that the prior lacks, as in the files that it
+            writes. Default: no.
         choice: How sure held-out data must show that a hybrid is better than the fitted prior. Default: 95 %.
         false_alarms_per_hour: Wanted rates of the monitor's false alarms [1/h], in rising order; limits are learned for
             the first rate that the undisturbed data are long enough for. A machine that stops at an alarm needs lower
@@ -222,6 +225,7 @@ class Scenario:
     beyond_recordings: bool = False
     disturbance_model: tuple[Disturbance, ...] | None = None
     terms: tuple[Term | Name, ...] = ()
+    explained: bool = False
     choice: ChoiceRule = field(default_factory=ChoiceRule)
     false_alarms_per_hour: tuple[Positive, ...] = ()
 

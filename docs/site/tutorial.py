@@ -81,7 +81,6 @@ def numbers(run: Path) -> dict[str, Any]:
             "seeds": loops.most_seeds,
             "tasks": [
                 {"name": name, "prior": by["prior_observer"].cost.mean, "hybrid": by["hybrid_observer"].cost.mean,
-                 "oracle": by["oracle"].cost.mean,
                  **{key: getattr(loops.comparisons[name]["prior_observer"], key) for key in ("ratio", "low", "high")}}
                 for name, by in loops.means.items()
             ],

@@ -93,7 +93,7 @@ def run(
 ) -> None:
     """Fit the prior, train, export, close the loop, learn alarm limits, analyze, and write a report.
 
-    The stages are data, explain, prior, training, choice, evaluation, export, track, noise, control, on_model,
+    The stages are data, explain, prior, training, choice, evaluation, export, track, noise, tasks, control, on_model,
     estimation, promises, watch, analysis and report. With --resume a stage runs again only if one of its inputs has
     changed.
     Exit code 1 if a stage after the export failed; the report gives the reason.

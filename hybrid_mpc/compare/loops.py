@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,8 +19,9 @@ from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.errors import InputError, no_exit
 from hybrid_mpc.estimate.kalman import Estimator
 from hybrid_mpc.files import digest, read_document, read_document_arrays, write_document
-from hybrid_mpc.kit.artifact import WATCHES, Kit
+from hybrid_mpc.kit.artifact import WATCHES, Kit, load
 from hybrid_mpc.kit.assembly import SOLVERS, make_adaptive_guard, make_backup_guard, make_resting_guard
+from hybrid_mpc.kit.parts import artifact_digest
 from hybrid_mpc.loop.faults import Fault, check_channels, fault_text, install
 from hybrid_mpc.loop.guard import Guard
 from hybrid_mpc.loop.plant import ModelPlant, Plant
@@ -489,6 +490,31 @@ def run_loops(
 
         yield bench.run(spec, on_step=on_step)[0]
     report(sum(lengths), sum(lengths), "")
+
+
+def run_specs(
+    scenario: str,
+    folder: Path,
+    specs: Sequence[LoopSpec],
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> list[LoopRow]:
+    """Rows of loops on a run's own model.
+
+    Loops whose monitors use no learned limits run without limits, as in a run whose stage watch has not run yet.
+    """
+    learned = any(spec.monitor not in ("own", "none") for spec in specs)
+    bench = bench_of(scenario, folder, artifact_digest(folder), learned)
+    return list(run_loops(bench, specs, report))
+
+
+@lru_cache(maxsize=1)
+def bench_of(scenario: str, folder: Path, content: str, learned: bool) -> Bench:
+    """A bench with the model of a run's folder with digest ``content``; ``learned``: with the monitor's limits.
+
+    The last bench is kept, so that a process which runs many parts reads the model once.
+    """
+    kit = load(folder)
+    return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, watch={})})
 
 
 def write_rows(path: Path, rows: Sequence[LoopRow], of: str) -> None:

@@ -201,7 +201,7 @@ def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tupl
 
 def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str) -> str:
     if best == prior:
-        return "The fitted prior is recommended: there is no hybrid."
+        return "The fitted prior is recommended: no network was trained."
     if not math.isfinite(figures[best].error):
         return f"The fitted prior is recommended: free runs of {best} diverge on validation recordings."
     own = figures[best if chosen == prior else chosen]

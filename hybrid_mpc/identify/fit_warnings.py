@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 AT_BOUND = 1e-3
 """Share of its range within which a parameter counts as at its bound."""
 NEARLY = 0.05
-"""Largest change of a parameter, and largest standard error, over its nominal value, that confirm the nominal value."""
+"""Largest change of an identified parameter over its nominal value that confirms the nominal value."""
 LATE = 4.0
 """Longest delay of the inputs [model periods] that is tested if no delay is fitted."""
 SHORT = 2.0
@@ -63,11 +63,9 @@ def warnings_of(
 
 def _confirmed(fit: OutputFit, chosen: Fitted) -> bool:
     """Whether the fit confirms the nominal values, as after they were taken from an earlier fit."""
-    count = len(fit.free)
-    nominal, sizes = fit.nominal[:count], np.abs(fit.nominal[:count])
-    near = np.abs(chosen.theta[:count] - nominal) <= NEARLY * sizes
-    sure = np.sqrt(np.maximum(np.diag(chosen.covariance)[:count], 0.0)) <= NEARLY * sizes
-    return bool(not chosen.unidentified and (near & sure).all())
+    nominal = fit.nominal[: len(fit.free)]
+    near = np.abs(chosen.theta[: len(nominal)] - nominal) <= NEARLY * np.abs(nominal)
+    return not chosen.unidentified and bool(near.all())
 
 
 def late_inputs(

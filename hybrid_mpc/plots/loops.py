@@ -1,4 +1,4 @@
-"""Figures of the closed loops: tracking, duration of a step, cost of each controller relative to the oracle."""
+"""Figures of the closed loops: tracking, duration of a step, cost of each controller relative to the prior's."""
 
 from __future__ import annotations
 
@@ -266,22 +266,24 @@ CONTROLLERS: Mapping[str, tuple[str, str, str, bool]] = {
 }
 
 Costs = Mapping[str, Mapping[str, tuple[float, float]]]
+BASELINE = "prior_observer"
+"""Controller that costs are relative to."""
 
 
 def costs(table: Costs) -> Figure:
-    """Closed-loop cost of every controller in every task, relative to the measuring oracle.
+    """Closed-loop cost of every controller in every task, relative to the prior with observer.
 
     The table holds, by task and controller, the mean cost and the half width of its 95 % interval. Both are divided by
-    the oracle's mean cost; the oracle's own interval shows the uncertainty of that mean. A missing controller or a mean
-    that is not finite leaves a gap. An interval that is not finite (a single seed) is not drawn. A task without the
-    oracle's cost keeps its row, with a note. The axis is logarithmic where costs span more than a factor of 5.
+    the mean cost of :data:`BASELINE`, whose own interval shows the uncertainty of that mean. A missing controller or a
+    mean that is not finite leaves a gap. An interval that is not finite (a single seed) is not drawn. A task without
+    a cost of the baseline keeps its row, with a note. The axis is logarithmic where costs span more than a factor of 5.
     """
     relative = {task: _relative(row) for task, row in table.items()}
     points = [mean for row in relative.values() for mean, _ in row.values()]
     if not points:
         raise InputError(
-            f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of the controller 'oracle', to"
-            " which costs are relative [HM-PLOTS-028]"
+            f"plot of the costs: none of the tasks {sorted(table)} has a positive cost of the controller {BASELINE!r}, "
+            "to which costs are relative [HM-PLOTS-028]"
         )
     there = {name for row in relative.values() for name in row}
     present = [name for name in CONTROLLERS if name in there] + sorted(there - set(CONTROLLERS))
@@ -295,7 +297,7 @@ def costs(table: Costs) -> Figure:
         if k:
             ax.axhline(k - 0.5, color="#dddddd", linewidth=0.8, zorder=1)
         if not row:
-            note, at = "no cost of the oracle", ax.get_yaxis_transform()
+            note, at = f"no cost of {name_of(BASELINE)}", ax.get_yaxis_transform()
             ax.text(0.98, k, note, transform=at, color=MUTED, fontsize=9, ha="right", va="center")
         for name, (mean, half) in row.items():
             at = k + 0.74 * ((present.index(name) + 0.5) / len(present) - 0.5)
@@ -309,14 +311,14 @@ def costs(table: Costs) -> Figure:
     ax.set_ylim(len(table) - 0.5, -0.5)
     ax.grid(False, axis="y")
     ax.tick_params(axis="y", length=0)
-    ax.set_xlabel("cost relative to the measuring oracle, with 95 % interval [-]")
+    ax.set_xlabel(f"cost relative to {name_of(BASELINE)}, with 95 % interval [-]")
     _legend(figure, ax, present)
     return figure
 
 
 def _relative(row: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """Finite means and half widths (0 where unknown), divided by the oracle's mean; empty without an oracle."""
-    scale = float(row.get("oracle", (math.nan, math.nan))[0])
+    """Finite means and half widths (0 where unknown), divided by the baseline's mean; empty without one."""
+    scale = float(row.get(BASELINE, (math.nan, math.nan))[0])
     if not (math.isfinite(scale) and scale > 0):
         return {}
     finite = {name: value for name, value in row.items() if math.isfinite(value[0])}

@@ -37,6 +37,8 @@ AVERAGES = (("short average", PALE, ":"), ("long average", LEVEL, "--"))
 """Label, colour and line style of a channel's moving averages, the shortest first."""
 NOTES, WIDTH = 6, 130
 """Maximum notes below a title, and characters of a line."""
+LINEAR = 2.0
+"""Ratio to a threshold up to which its axis is linear."""
 
 
 def channels(
@@ -154,11 +156,12 @@ def _shade(ax: Axes, spans: Sequence[tuple[float, float]], label: str, **style: 
 
 
 def _scores(ax: Axes, trace: Trace) -> None:
-    """Draw the largest ratio to a threshold, linear up to 2 and logarithmic beyond."""
+    """Draw the largest ratio to a threshold, linear up to ``LINEAR`` and logarithmic beyond."""
     ax.plot(trace.t, trace.share, color=LEVEL, linewidth=1.2)
     ax.axhline(1.0, color="black", linestyle="--", linewidth=1.2, label="threshold")
-    ax.set_yscale("symlog", linthresh=2.0, linscale=2.0)
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    if np.any(trace.share > LINEAR):  # below, the ticks of a symlog axis are only its ends, e.g. 1.12068
+        ax.set_yscale("symlog", linthresh=LINEAR, linscale=2.0)
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ax.set_ylim(bottom=0.0)
     ax.set_ylabel("share of\nthreshold [-]")
 

@@ -6,7 +6,7 @@ import base64
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -173,8 +173,14 @@ def _library() -> Markup:
     return Markup("\n".join(Resources(mode="inline", components=["bokeh"]).js_raw))
 
 
-def words(file: str) -> dict[str, tuple[Markup, ...]]:
+def words(
+    file: str, models: Collection[str] = ("rnn", "pgrnn", "mopgrnn", "oracle")
+) -> dict[str, tuple[Markup, ...]]:
     """General texts of a page's sections, from a template with one block for each section.
+
+    Args:
+        file: Name of the template.
+        models: Kinds of networks that the page describes, and ``"oracle"``. Default: all.
 
     Example:
         >>> len(words("run_words.html")["training"])
@@ -182,7 +188,7 @@ def words(file: str) -> dict[str, tuple[Markup, ...]]:
     """
     template, texts = _template(file), {}
     for name, block in template.blocks.items():  # type: ignore[attr-defined]
-        paragraphs = "".join(block(template.new_context())).split("\n\n")
+        paragraphs = "".join(block(template.new_context({"models": models}))).split("\n\n")
         texts[name] = tuple(Markup(" ".join(paragraph.split())) for paragraph in paragraphs)
     return texts
 

@@ -161,25 +161,40 @@ def replay(
 
     Example: ``replay(kit.monitor(), kit.observer(), recording).by_channel()``
     """
+    return replays([monitor], estimator, recording, on_sample=on_sample, on_progress=on_progress)[0]
+
+
+def replays(
+    monitors: Sequence[Monitor],
+    estimator: EstimatorLike,
+    recording: TrajectoryLike,
+    *,
+    on_sample: Callable[[int, Any], None] = lambda k, estimate: None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Trace]:
+    """:func:`replay` of several monitors of one model, which share the estimates."""
+    model = monitors[0].model
     t, y, u = (np.asarray(a, dtype=np.float64) for a in (recording.t, recording.y, recording.u))
-    _check(t, y, u, monitor.model.dt)
+    _check(t, y, u, model.dt)
     ws: Any = getattr(recording, "w", None)
-    known = monitor.model.n_w and ws is not None
-    state, estimate, readings = monitor.initial(), None, []
+    known = model.n_w and ws is not None
+    states, estimate = [monitor.initial() for monitor in monitors], None
+    readings: list[list[Reading]] = [[] for _ in monitors]
     for k in range(t.size):
         if k % REPORTED == 0:
             on_progress(k, t.size)
         also: dict[str, Any] = {"w": ws[k]} if known else {}
-        u_prev = u[k - 1] if k else np.full(monitor.model.n_u, np.nan)
+        u_prev = u[k - 1] if k else np.full(model.n_u, np.nan)
         if estimate is None:
             estimate = estimator.start(y[k], float(t[0]), **also)
         else:
             estimate = estimator.update(estimate, y[k], u_prev, **also)
-        state, reading = monitor.update(state, y[k], u_prev, estimate)
-        readings.append(reading)
+        for i, monitor in enumerate(monitors):
+            states[i], reading = monitor.update(states[i], y[k], u_prev, estimate)
+            readings[i].append(reading)
         on_sample(k, estimate)
     on_progress(t.size, t.size)
-    return trace_of(monitor, t, readings)
+    return [trace_of(monitor, t, own) for monitor, own in zip(monitors, readings, strict=True)]
 
 
 def along(

@@ -134,6 +134,7 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Pa
         "scenario = replace(", "    machine,", f"    name={explained_name(scenario.name)!r},",
         f"    title={scenario.title + ', with found terms'!r},",
         f"    prior=with_nominal(extended(type(machine.prior()), *TERMS), FITTED{', POINT' if point else ''}),",
+        "    explained=True,",
     ]  # fmt: skip
     if scenario.control is not None and any(state_of(term) for term in found.found):
         lines += [

@@ -100,7 +100,7 @@ def run(
     check_data(context.as_given)
     check_device(settings.device)
     if settings.deploy:
-        there = models_of(scenario.prior())
+        there = models_of(context)
         known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
     end = _end(context, only)
     took: dict[str, float] = {}

@@ -493,10 +493,10 @@ def test_a_fit_that_hardly_improves_says_so_unless_it_confirms_its_nominal_value
     free = tuple(replace(p, value=TRUTH[p.name]) for p in Pendulum.parameters if not p.fixed)
     ones = np.ones(len(free))
     problem = SimpleNamespace(free=free, nominal=ones, lower=0.0 * ones, upper=3.0 * ones)
-    sure, unsure = (Fitted(ones, size**2 * np.eye(len(free)), ()) for size in (0.01, 0.2))
-    moved = Fitted(1.2 * ones, sure.covariance, ())
-    said = [len(warnings_of(problem, one, 0.0, 0.999)) for one in (sure, unsure, moved)]
-    assert said == [0, 1, 1]
+    sure, rough = (Fitted(ones, size**2 * np.eye(len(free)), ()) for size in (0.01, 0.2))
+    moved, unknown = replace(sure, theta=1.2 * ones), replace(rough, unidentified=("m is not identifiable",))
+    said = [len(warnings_of(problem, one, 0.0, 0.999)) for one in (sure, rough, moved, unknown)]
+    assert said == [0, 0, 1, 2]
 
 
 def test_recordings_that_follow_each_other_count_as_one() -> None:

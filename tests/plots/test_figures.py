@@ -169,6 +169,18 @@ def test_the_enlarged_pole_map_holds_the_slow_poles():
     assert abs(pole.imag) < zoom.get_ylim()[1]
 
 
+@pytest.mark.parametrize("most", [1.06731, 1.9, 2.5, 730.0])
+def test_numbers_at_the_monitor_s_axes_have_three_digits(most):
+    t = np.linspace(0.0, 1.0, 100)
+    values, share = np.sin(t)[:, None] * [1.0, 1.0], most * t
+    trace = example.monitor_trace(t, values, values[:, :1], share)
+    figure = monitor.channels(trace, values[:, :1], outputs=(Y,), limits=example.LIMITS)
+    figure.canvas.draw()
+    labels = [label.get_text() for ax in figure.axes for label in ax.get_yticklabels()]
+    digits = [re.sub(r"\D", "", label).strip("0") for label in labels]
+    assert max(map(len, digits)) <= 3
+
+
 def test_alarm_intervals():
     t = np.arange(5.0)
     assert monitor.intervals(t, [True, False, True, True, True]) == [(0.0, 1.0), (2.0, 4.0)]

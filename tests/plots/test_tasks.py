@@ -10,7 +10,7 @@ from hybrid_mpc.plots.loops import CONTROLLERS, costs
 from hybrid_mpc.plots.style import save
 
 NAN = math.nan
-ROW = {"prior": (8.0, 1.0), "hybrid": (2.4, 0.2), "oracle": (2.0, 0.1)}
+ROW = {"prior": (8.0, 1.0), "hybrid": (2.4, 0.2), "prior_observer": (2.0, 0.1)}
 
 
 def names(figure):
@@ -22,7 +22,7 @@ def points(ax):
     return [(line.get_xdata()[0], line.get_ydata()[0]) for line in ax.lines if len(line.get_xdata()) == 1]
 
 
-def test_costs_are_relative_to_the_measuring_oracle():
+def test_costs_are_relative_to_the_prior_with_observer():
     ax = costs({"track": ROW}).axes[0]
     assert sorted(x for x, _ in points(ax)) == pytest.approx([1.0, 1.2, 4.0])
     intervals = [
@@ -63,12 +63,12 @@ def test_what_is_missing_leaves_a_gap(tmp_path):
         "full": ROW,
         "single seed": {name: (mean, NAN) for name, (mean, _) in ROW.items()},
         "failed": ROW | {"prior": (NAN, NAN), "hybrid": (math.inf, 1.0)},
-        "no oracle": {"prior": (1.0, 0.1)},
-        "bad oracle": {"prior": (1.0, 0.1), "oracle": (NAN, NAN)},
+        "no baseline": {"prior": (1.0, 0.1)},
+        "bad baseline": {"prior": (1.0, 0.1), "prior_observer": (NAN, NAN)},
     }
     figure = costs(table)
     assert len(points(figure.axes[0])) == 3 + 3 + 1
-    assert [text.get_text() for text in figure.axes[0].texts] == ["no cost of the oracle"] * 2
+    assert [text.get_text() for text in figure.axes[0].texts] == ["no cost of prior with observer"] * 2
     assert len(figure.axes[0].get_yticklabels()) == 5
     assert save(figure, tmp_path / "a.png").exists()
 
@@ -78,8 +78,8 @@ def test_an_unknown_controller_is_drawn_under_its_name():
 
 
 @pytest.mark.parametrize(
-    "table", [{}, {"a": {}}, {"a": {"prior": (1.0, 0.1)}}, {"a": {"oracle": (0.0, 0.0)}}]
+    "table", [{}, {"a": {}}, {"a": {"prior": (1.0, 0.1)}}, {"a": {"prior_observer": (0.0, 0.0)}}]
 )
-def test_costs_without_an_oracle_are_refused(table):
+def test_costs_without_the_baseline_are_refused(table):
     with pytest.raises(InputError, match="HM-PLOTS-028"):
         costs(table)

@@ -24,6 +24,7 @@ from hybrid_mpc.workflow.explained import scenario_code
 from hybrid_mpc.workflow.stage import bring_up_to_date
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.identify import DATA, PRIOR
+from hybrid_mpc.workflow.stages.promises import found_terms
 
 LAWS = ("coulomb", "quadratic")
 DRY = 0.08
@@ -96,6 +97,9 @@ def test_its_scenario_has_the_prior_of_the_explanation(explained, machine, files
         rtol=1e-5,
     )
     assert scenario.prior({"d": 0.2}).values["d"] == 0.2
+    own, given = (Context(RunSettings(one.name), one, out) for one in (scenario, base))
+    assert found_terms(own) == tuple(term.name for term in found.explanation.found)
+    assert found_terms(given) is None
     code, told, _ = call("check", out / found.file, *(word for path in files for word in ("--data", path)))
     assert code == 0
     assert "F_c_phi_dot" in told

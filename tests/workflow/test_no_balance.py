@@ -39,7 +39,10 @@ class Bodies(Prior):
 scenario = Scenario(
     "bodies", "Two bodies", "", prior=Bodies,
     data=DataSpec("t", ("p",), ("c", "s"), dt=2.0, max_gap=5.0, smoothing=10.0, warm_up=10.0),
-    budgets={"quick": Budget(hidden=4, networks=2, teacher_steps=10, free_run_steps=5, seeds=1)},
+    budgets={
+        "quick": Budget(hidden=4, networks=2, teacher_steps=10, free_run_steps=5, seeds=1),
+        "prior": Budget(1, 1, 0, 0, seeds=1),
+    },
 )
 """
 
@@ -102,6 +105,23 @@ def test_the_report_has_the_units_of_the_machine_and_says_what_is_missing(bodies
     for words in ("RMSE of cold [degC]", "RMSE of sensor [mV]", "FIT of sensor [%]", "There is no MOPGRNN"):
         assert words in text
     assert not re.search(r"\[(rad|W|N m)\]", text.partition("Names and definitions")[0])
+
+
+def test_a_run_without_training_mentions_no_network(jobs_here, tmp_path):
+    (tmp_path / "bodies.py").write_text(MACHINE)
+    data, out = recording(tmp_path / "run.csv"), tmp_path / "run"
+    words = ("run", tmp_path / "bodies.py", "--data", data, *SKIPPED, "--budget", "prior", "--out", out)
+    done = CliRunner().invoke(app, [*map(str, words)])
+    assert done.exit_code == 0, done.output
+    results = read_results(out / "results.json")
+    assert set(results.evaluation.scores) == {"phy_nominal", "phy"}
+    assert set(results.choice.choice.candidates) == {"phy"} == {results.choice.choice.recommended}
+    page = (out / "report.html").read_text()
+    assert "RNN" not in done.stdout.upper() + re.sub(r"<[^>]+>|[\w+/]{80,}", " ", page)
+    models = load(out / "model").models  # the kit's hybrid equals the prior
+    x, u, none = np.array([70.0, 50.0]), np.array([20.0]), np.zeros(0)
+    steps = [m.step(x, np.zeros(m.n_h), u, none, m.p)[0].full() for m in models.values()]
+    np.testing.assert_allclose(steps[0], steps[1], rtol=1e-12)  # rounding
 
 
 def test_a_model_that_is_not_there_cannot_be_deployed(call, bodies, tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hybrid_mpc import InputError, RunSettings, load, load_scenario
+from hybrid_mpc.cli.run import run
 from hybrid_mpc.engine import Progress
 from hybrid_mpc.workflow import run as job
 from hybrid_mpc.workflow import stage as stages
@@ -425,6 +426,11 @@ def test_loops_read_tasks_by_what_they_say(tmp_path):
     assert keys(figures=eval("lambda result: {}"))[f"task {name}"] == ""
 
 
+def test_the_help_of_run_names_every_stage():
+    names = run.__doc__.partition("The stages are ")[2].partition(". ")[0]
+    assert tuple(re.split(r",\s+|\s+and\s+", names)) == NAMES
+
+
 def test_changes_are_named():
     assert changed({"a": "1", "b": "2"}, {"a": "3", "c": "4"}) == "changed: a, c, b"
     assert changed({}, {"plant": ""}) == "plant may have changed: a change cannot be detected"
@@ -434,7 +440,10 @@ def test_the_observer_s_stage_names_what_it_reads():
     """A horizon of its own is no change of weights alone."""
     scenario = load_scenario("golf_robot")
     longer = replace(scenario, control=scenario.control.changed(horizon=scenario.control.horizon + 1))
-    before, now = (observed(SimpleNamespace(scenario=one)) for one in (scenario, longer))
+    before, now = (
+        observed(SimpleNamespace(scenario=one, budget=scenario.budgets["quick"]))
+        for one in (scenario, longer)
+    )
     (label,) = [name for name in now if repr(now[name]) != repr(before[name])]
     assert "horizon" in label
     assert differing({label: "1"}, {label: "2"}) == f"changed: {label}"

@@ -7,15 +7,9 @@ import pytest
 
 from hybrid_mpc import Promise
 from hybrid_mpc.identify.choose import CandidateFigures
-from hybrid_mpc.identify.explanation import Evidence, Explanation, HeldOutError
 from hybrid_mpc.workflow.stages.answers import controller_answer
 from hybrid_mpc.workflow.stages.promises import STRUCTURE, structure
 from hybrid_mpc.workflow.stages.results import read_results
-
-NOTHING = Explanation(
-    "Prior", 1.0, 0.1, HeldOutError(0.1, 1.0, 1.0, 1.0, 1.0), (), (), (), Evidence(6, 6, 5, 1.0, "6 recordings"), 30,
-    "none",
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +35,7 @@ def test_a_network_with_clearly_less_error_is_a_sign_of_a_missing_term(results, 
 def test_a_recommended_network_is_one_until_the_search_was_made(results):
     own = choice(results, 0.9, results.choice.choice.hybrid)
     assert structure(results.prior, own).verdict == "doubted"
-    row = structure(results.prior, own, NOTHING)
+    row = structure(results.prior, own, ())
     assert (row.verdict, row.remedy) == ("shown", "")
     assert "0.90" in row.evidence
 
@@ -49,7 +43,7 @@ def test_a_recommended_network_is_one_until_the_search_was_made(results):
 def test_doubts_that_a_missing_term_explains_name_the_search(results):
     lacks = replace(results.prior, in_doubt=("k ends at its bound",), lacking=("k ends at its bound",))
     assert "hybrid-mpc explain" in structure(lacks, choice(results, 1.0)).remedy
-    assert "hybrid-mpc explain" not in structure(lacks, choice(results, 1.0), NOTHING).remedy
+    assert "hybrid-mpc explain" not in structure(lacks, choice(results, 1.0), ()).remedy
     wrong = replace(results.prior, in_doubt=("k: its sign seems wrong",))
     row = structure(wrong, choice(results, 1.0))
     assert row.verdict == "doubted"

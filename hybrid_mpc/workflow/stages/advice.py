@@ -117,6 +117,8 @@ def _tracked(results: Results) -> Iterator[Hint]:
 def _choice(results: Results, explained: bool) -> Iterator[Hint]:
     choice = results.choice.choice
     own = choice.candidates[choice.hybrid]
+    if choice.hybrid == "phy":
+        return  # no network was trained
     if choice.recommended != "phy":
         if not explained:
             yield Hint("plain", "A network improves the prior, so a physical term may be missing.", SEARCH)

@@ -22,7 +22,7 @@ from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, models_of
 
 Array = NDArray[np.float64]
 CANDIDATES = ("phy", "pgrnn", "mopgrnn")
-"""Candidates for the recommendation: the fitted prior, and the hybrids that :func:`models_of` the prior has."""
+"""Candidates for the recommendation: the fitted prior, and the hybrids that :func:`models_of` the run has."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class ChoiceResult:
 
     @property
     def deployed(self) -> str:
-        """The kind of network that is exported as the hybrid."""
+        """The kind of network that is exported as the hybrid; ``"phy"`` if no network was trained."""
         return self.choice.hybrid
 
 
@@ -54,7 +54,7 @@ def choice_stage(context: Context) -> ChoiceResult:
     prior, spec, warm = context.prior, context.spec, context.warm
     phy = context.scenario.prior(prior.fit.values)
     smoother = prior.fit.smoother(phy, spec.dt)
-    candidates = [name for name in models_of(phy) if name in CANDIDATES]
+    candidates = [name for name in models_of(context) if name in CANDIDATES]
     settings = training_settings(context, "pgrnn")
     runs = unseen_runs(
         settings, context.smoothed("train"), context.smoothed("valid"), smoother, prior.longest_run

@@ -6,8 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from pathlib import Path
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,12 +16,11 @@ from hybrid_mpc.compare.controllers import COMPARED, OBSERVERS, ORACLES
 from hybrid_mpc.compare.loops import (
     DRAWN,
     MODEL,
-    Bench,
     LoopRow,
     LoopSpec,
     arrays_of,
     read_rows,
-    run_loops,
+    run_specs,
     write_rows,
 )
 from hybrid_mpc.compare.sequential import Comparison, compare_costs, hardest, looks
@@ -30,10 +28,9 @@ from hybrid_mpc.compare.summary import ClosedLoops, StepTimes, Summary, by_task,
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.engine import WORKERS, run_jobs
 from hybrid_mpc.files import digest
-from hybrid_mpc.kit.artifact import load
-from hybrid_mpc.kit.parts import LoopSettings, artifact_digest, loop_settings, read_parts
+from hybrid_mpc.kit.parts import LoopSettings, loop_settings, read_parts
 from hybrid_mpc.loop.loop import Loop
-from hybrid_mpc.scenario import Budget, Scenario, Task, load_scenario
+from hybrid_mpc.scenario import Budget, Scenario, Task
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import UNKNOWN, Absent, Stage, source_of, sources
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE, observed
@@ -134,6 +131,11 @@ class ControlResult(ClosedLoops):
             return float(np.mean(known)), ""
         return None, "; ".join(dict.fromkeys(reason for _, reason in self.gaps.values())) or self.reason
 
+    @property
+    def has_oracle(self) -> bool:
+        """Whether an oracle ran."""
+        return any(row.controller in ORACLES for row in self.rows)
+
     def cost(self, controller: str) -> float | None:
         """Sum over the tasks of a controller's mean costs; None without loops, or if one diverged."""
         own = [cells[controller].cost.mean for cells in self.means.values() if controller in cells]
@@ -225,7 +227,7 @@ def gap_closed(cells: Mapping[str, Sequence[LoopRow]]) -> tuple[float | None, st
     gap closed = (J_baseline - J_hybrid) / (J_baseline - J_oracle), with mean costs J over the seeds.
     """
     if "oracle" not in cells:
-        return None, "the scenario has no oracle"
+        return None, "no oracle ran"
     costs = {name: np.array([row.cost for row in rows]) for name, rows in cells.items()}
     baseline = min((costs[n] for n in BASELINES if n in costs), key=lambda c: float(c.mean()))
     hybrid, oracle = costs[REPORTED["hybrid"]], costs["oracle"]
@@ -291,28 +293,6 @@ def _seeds(name: str, scenario: Scenario, seeds: int, oracle_seeds: int) -> int:
         return seeds
     # an oracle with the true state uses no measurement, so seeds only change the rival plans of BestOf
     return 0 if scenario.oracle is None else (oracle_seeds if name == "oracle" else min(1, oracle_seeds // 2))
-
-
-def run_specs(
-    scenario: str,
-    folder: Path,
-    specs: Sequence[LoopSpec],
-    report: Callable[[int, int, str], None] = lambda done, total, text: None,
-) -> list[LoopRow]:
-    """Rows of loops on a run's own model.
-
-    Loops whose monitors use no learned limits run without limits, as in a run whose stage watch has not run yet.
-    """
-    learned = any(spec.monitor not in ("own", "none") for spec in specs)
-    bench = _bench(scenario, folder, artifact_digest(folder), learned)
-    return list(run_loops(bench, specs, report))
-
-
-@lru_cache(maxsize=1)
-def _bench(scenario: str, folder: Path, content: str, learned: bool) -> Bench:
-    """A bench with the model of a run's folder with digest ``content``; ``learned``: with the monitor's limits."""
-    kit = load(folder)
-    return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, watch={})})
 
 
 def run_or_read(

@@ -100,7 +100,7 @@ def evaluation_stage(context: Context) -> EvaluationResult:
     arrays: dict[str, Array] = {}
     bands: dict[str, BandScores] = {}
     spread = smoother.sizes.y
-    models = models_of(phy)
+    models = models_of(context)
     for i, name in enumerate(models):
         context.progress.update("models", i, len(models), name)
         share = chosen.choice.share(name)

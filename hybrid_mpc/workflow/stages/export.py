@@ -31,7 +31,7 @@ from hybrid_mpc.model.disturbance import Disturbance
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage, source_of
 from hybrid_mpc.workflow.stages.choose import CHOICE
-from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, trained_models
+from hybrid_mpc.workflow.stages.identify import DATA, PRIOR, TRAINING, UNTRAINED, trained_models
 from hybrid_mpc.workflow.stages.track import TRACK
 
 FEW = 10
@@ -79,7 +79,8 @@ def export_stage(context: Context) -> ExportResult:
     """Write hybrid, fitted prior and each network of the hybrid as one artifact; compare all of them with torch."""
     dt, settings, prior, chosen = context.spec.dt, context.settings, context.prior, context.read(CHOICE)
     phy = context.scenario.prior(prior.fit.values)
-    trained = trained_models(context, chosen.deployed).shrunk(phy, chosen.choice.share(chosen.deployed))
+    kind = UNTRAINED if chosen.deployed == "phy" else chosen.deployed
+    trained = trained_models(context, kind).shrunk(phy, chosen.choice.share(kind))
     alone = trained.steps(phy, dt)[:MOST_MEMBERS] if len(trained.validation) > 1 else []
     members = member_names(len(alone))
     steps: dict[str, RecurrentStep | PriorStep] = {
@@ -158,7 +159,8 @@ def noise_stage(context: Context) -> NoiseResult | Absent:
         put_noise(context, NoiseResult({}, of, context.scenario.disturbance_model))
         return Absent(f"scenario {context.scenario.name} defines no control problem")
     kit = context.kit
-    found = noise_of(context.scenario, kit, context.commanded("train"))
+    scenario = context.scenario if context.budget.oracle_seeds else replace(context.scenario, oracle=None)
+    found = noise_of(scenario, kit, context.commanded("train"))
     noise = {name: tuple(sigma.tolist()) for name, sigma in found.items()}
     result = NoiseResult(noise, of, kit.loop.disturbance_model)
     put_noise(context, result)
@@ -202,7 +204,7 @@ def observed(context: Context) -> dict[str, object]:
         "beyond recordings": scenario.beyond_recordings,
         "disturbance model": scenario.disturbance_model,
         "weights of outputs or horizon": None if control is None else (control.q_y, control.horizon),
-        "oracle": source_of(scenario.oracle),
+        "oracle": source_of(scenario.oracle) if context.budget.oracle_seeds else None,
     }
 
 

@@ -14,7 +14,6 @@ from hybrid_mpc.compare.loop_figures import curves_of, loop_figure
 from hybrid_mpc.compare.loops import ON_MODEL
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.identify.evaluate import Scores, input_correlation
-from hybrid_mpc.identify.settings import kinds_of
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.plots import analysis, animation, data, estimation, explain, fit, loops, monitor
 from hybrid_mpc.plots.interactive import over_time, write_interactive
@@ -28,7 +27,7 @@ from hybrid_mpc.workflow.stages.compare import CONTROL, REPORTED
 from hybrid_mpc.workflow.stages.estimate import ESTIMATION, OBSERVERS
 from hybrid_mpc.workflow.stages.evaluate import EVALUATION, finite
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
-from hybrid_mpc.workflow.stages.identify import PRIOR, TRAINING, trained_models
+from hybrid_mpc.workflow.stages.identify import PRIOR, TRAINING, trained_kinds, trained_models
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL
 from hybrid_mpc.workflow.stages.watch import WATCH, clean_windows, read_trace
 
@@ -119,7 +118,7 @@ def _data(context: Context) -> Any:
 def _training(context: Context) -> Any:
     curves: dict[str, dict[str, Any]] = {}
     starts: dict[str, float] = {}
-    for kind in reversed(kinds_of(context.scenario.prior())):
+    for kind in reversed(kinds := trained_kinds(context)):
         trained = trained_models(context, kind)
         objectives = [name.removeprefix("loss_") for name in trained.curve if name.startswith("loss_")]
         names = ["validation", f"loss_{objectives[0]}"]
@@ -127,6 +126,8 @@ def _training(context: Context) -> Any:
             names += [f"loss_{name}" for name in objectives[1:]] + [f"bound_{name}" for name in objectives]
         curves[kind] = {name: trained.curve[name][:, trained.best] for name in ["step", *names]}
         starts[kind] = float(trained.settings.teacher_steps)
+    if not kinds:
+        return
     units = {b.name: b.rate_unit for b in context.scenario.prior().equations.balances}
     figure = fit.curves(curves, free_run_start=starts, units=units)
     caption = "Objectives and bounds on fixed training windows, for the best network of each kind by validation error."
@@ -149,7 +150,7 @@ def _free_runs(context: Context) -> Any:
             fit.BalanceRun(b.name, b.rate_unit, own["balances"][:, i], own["balances_hat"][:, i])
             for i, b in enumerate(prior.equations.balances)
         ]
-        shown = ("phy_nominal", "phy", "rnn", deployed)
+        shown = [m for m in ("phy_nominal", "phy", "rnn", deployed) if m in found.scores]
         figure = fit.free_run(
             own["t"], drawn(f"{deployed}/{run}"), {m: drawn(f"{m}/{run}", "_hat") for m in shown}, own["u"],
             signals=signals, inputs=prior.inputs, balances=balances, hybrid=deployed,
@@ -160,7 +161,7 @@ def _free_runs(context: Context) -> Any:
     yield from _unexplained(context, deployed)
     metrics = metrics_of(prior)
     values = {m: _flat(scores.model) for m, scores in found.scores.items()}
-    every = {str(m): [_flat(n) for n in found.scores[m].networks] for m in kinds_of(prior)}
+    every = {str(m): [_flat(n) for n in found.scores[m].networks] for m in trained_kinds(context)}
     spread = {
         m: {k: float(np.std([n[k] for n in own])) for k in metrics}
         for m, own in every.items()
@@ -258,8 +259,10 @@ def _overview(context: Context) -> Any:
         task: {name: (_number(cell.cost.mean), _number(cell.cost.ci95)) for name, cell in cells.items()}
         for task, cells in found.means.items()
     }
-    if any("oracle" in row for row in table.values()):
-        text = "Closed-loop cost of every controller over the measuring oracle's, with 95 % intervals over the seeds."
+    if any(row.get(loops.BASELINE, (np.nan, np.nan))[0] > 0 for row in table.values()):
+        text = (
+            "Closed-loop cost of every controller over that of the prior with observer, with 95 % intervals."
+        )
         yield "control", "costs", loops.costs(table), text
     if scenario.figures is not None:
         for name, (figure, caption) in scenario.figures(found.rows).items():

@@ -34,7 +34,7 @@ from hybrid_mpc.identify.linear import BASELINES, LinearModel
 from hybrid_mpc.identify.own_fits import fit_each
 from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
-from hybrid_mpc.identify.settings import KINDS, TrainingSettings, kinds_of
+from hybrid_mpc.identify.settings import KINDS, Kind, TrainingSettings, kinds_of
 from hybrid_mpc.identify.simulation import measured_as
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.identify.sound import (
@@ -68,6 +68,8 @@ Array = NDArray[Any]
 
 MODELS = ("phy_nominal", "phy", *KINDS)
 """Models that may be evaluated; those of a prior: :func:`models_of`."""
+UNTRAINED: Kind = "pgrnn"
+"""The kit's hybrid of a run without training: its correction is zero."""
 PARTS = 4
 """Smallest number of parts of the training data: a network that leaves one out still uses three quarters."""
 REMEDY = (
@@ -459,20 +461,26 @@ def what_training_reads(context: Context) -> dict[str, object]:
     """Settings of the networks, the device, and the period of the recordings."""
     return {
         "settings of the networks": {
-            kind: training_settings(context, kind) for kind in kinds_of(context.scenario.prior())
+            kind: training_settings(context, kind) for kind in trained_kinds(context) or (UNTRAINED,)
         },
         "device": context.settings.device,
         "period": context.spec.dt,
     }
 
 
-def models_of(prior: Prior) -> tuple[str, ...]:
-    """Names of the models to evaluate: nominal prior, fitted prior, and each kind of network."""
-    return ("phy_nominal", "phy", *kinds_of(prior))
+def trained_kinds(context: Context) -> tuple[Kind, ...]:
+    """Kinds of networks that the run trains; empty if its settings have no optimizer steps."""
+    own = training_settings(context, UNTRAINED)
+    return kinds_of(context.scenario.prior()) if own.teacher_steps + own.free_run_steps else ()
+
+
+def models_of(context: Context) -> tuple[str, ...]:
+    """Names of the models to evaluate: nominal prior, fitted prior, and each kind of trained network."""
+    return ("phy_nominal", "phy", *trained_kinds(context))
 
 
 def training_stage(context: Context) -> TrainingResult:
-    """Train the networks of every kind, two kinds at once."""
+    """Train the networks of every kind, two kinds at once; without training, make only the kit's hybrid."""
     # networks of other settings or data have a folder of their own
     name = digest(TRAINING.keys(context))[:12]
     folder = context.out / "checkpoints" / "training" / name
@@ -481,7 +489,7 @@ def training_stage(context: Context) -> TrainingResult:
         context.prior.fit.values,
         context.smoothed("train"),
         context.smoothed("valid"),
-        {kind: _as_long_as_judged(context, kind) for kind in kinds_of(context.scenario.prior())},
+        {kind: _as_long_as_judged(context, kind) for kind in trained_kinds(context) or (UNTRAINED,)},
         folder.resolve(),
         device=context.settings.device,
         workers=context.workers,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from hybrid_mpc.compare.promises import TaskEnd, Tested, examine, task_end
 from hybrid_mpc.compare.tasks import tasks_of
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.choose import CandidateFigures, Choice
-from hybrid_mpc.identify.explanation import Explanation
 from hybrid_mpc.identify.sound import CLEARLY
 from hybrid_mpc.kit.promises import Promise, PromiseTable, read_promises, write_promises
 from hybrid_mpc.scenario import Task
@@ -53,25 +52,28 @@ def promises_stage(context: Context) -> PromiseTable | Absent:
         tested=_tested(context, controller, kit.models[kit.recommended].n_y),
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
-    explained = context.find(EXPLAIN)
-    of_prior = structure(
-        context.prior,
-        context.read(CHOICE).choice,
-        None if isinstance(explained, Absent) else explained.explanation,
-    )
+    of_prior = structure(context.prior, context.read(CHOICE).choice, found_terms(context))
     result = PromiseTable((of_prior, *found), kit.identity)
     put_promises(context, result)
     return result
 
 
-def structure(prior: PriorResult, choice: Choice, explained: Explanation | None = None) -> Promise:
+def found_terms(context: Context) -> tuple[str, ...] | None:
+    """Names of the terms that a search for missing terms found, in this run or for its scenario; None without one."""
+    found, scenario = context.find(EXPLAIN), context.scenario
+    if not isinstance(found, Absent):
+        return tuple(term.name for term in found.explanation.found)
+    return tuple(term.name for term in getattr(scenario.prior, "terms", ())) if scenario.explained else None
+
+
+def structure(prior: PriorResult, choice: Choice, explained: Sequence[str] | None = None) -> Promise:
     """Row of the table: whether the structure of the fitted prior is in doubt.
 
     Args:
         prior: The fitted prior, with the doubts about its present terms and signals.
         choice: Choice among prior and networks: a clearly lower held-out error of a network is a sign of a missing
             term.
-        explained: Result of the search for missing terms. Default: none was made.
+        explained: Names of the terms that a search for missing terms found. Default: none was made.
     """
     errors = {
         "the fitted prior": prior.errors["phy"].error,
@@ -91,7 +93,7 @@ def structure(prior: PriorResult, choice: Choice, explained: Explanation | None 
     if own is not None and network_gains(choice, own):
         gain = f"; with {choice.hybrid}, the held-out error is {own.ratio:.2f} times that of the fitted prior"
     if explained is not None:
-        terms = ", ".join(term.name for term in explained.found) or "none"
+        terms = ", ".join(explained) or "none"
         return Promise(
             STRUCTURE, "shown", f"{present}; missing terms found by the search: {terms}{gain}; {evidence}"
         )
@@ -154,7 +156,8 @@ def put_promises(context: Context, table: PromiseTable) -> str:
 
 def what_promises_read(context: Context) -> Mapping[str, object]:
     """Everything that the loops depend on, with a plant or with a model as plant."""
-    return {**what_on_model_reads(context), **what_loops_read(context)}
+    searched = {"a search for missing terms": context.scenario.explained}
+    return {**what_on_model_reads(context), **what_loops_read(context), **searched}
 
 
 PROMISES = Stage(

@@ -40,8 +40,9 @@ from hybrid_mpc.workflow.stages.evaluate import EVALUATION, EvaluationResult, fi
 from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import ExportResult
 from hybrid_mpc.workflow.stages.figures import OBSERVER_TITLES, Figures, draw_all, draw_first
-from hybrid_mpc.workflow.stages.identify import DATA, DataResult, models_of, training_settings
+from hybrid_mpc.workflow.stages.identify import DATA, DataResult, models_of, trained_kinds, training_settings
 from hybrid_mpc.workflow.stages.on_model import OnModelResult
+from hybrid_mpc.workflow.stages.promises import found_terms
 from hybrid_mpc.workflow.stages.results import SHOWN, Results, collect
 from hybrid_mpc.workflow.stages.track import TrackResult
 from hybrid_mpc.workflow.stages.watch import CleanAlarms, FaultedLoop, WatchResult
@@ -97,7 +98,7 @@ def report_so_far(context: Context) -> None:
     }
     if "free_run" in figures:
         tables["free_run"] = _free_run_tables(context)
-    texts = words("run_words.html")
+    texts = words("run_words.html", trained_kinds(context))
     shown = [key for key in TITLES if key in figures or key in tables]
     sections = [Section(TITLES[key], texts[key], figures.get(key, ()), tables.get(key, ())) for key in shown]
     going = "The run is not finished. It updates this page after its first stages and at its end; reload the page."
@@ -170,7 +171,9 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         # without pictures and tables the general text of the section has nothing to explain
         if key in after and not figures.get(key) and not any(t.rows for t in tables.get(key, ())):
             instead[key] = after.pop(key)
-    texts = words("run_words.html")
+    loops = closed_loops(results.control)
+    oracle = ("oracle",) if loops is not None and loops.has_oracle else ()
+    texts = words("run_words.html", (*trained_kinds(context), *oracle))
     sections = tuple(
         Section(
             TITLES[key],
@@ -191,7 +194,7 @@ def _report(context: Context, results: Results, figures: Figures) -> Report:
         (),
         sections,
         f"seed {results.seed}, budget {results.budget}; {versions}",
-        advice(results, explained=_explained(context), declared=context.scenario.sensor_sigma),
+        advice(results, explained=found_terms(context) is not None, declared=context.scenario.sensor_sigma),
         doubt_of(results.prior.in_doubt),
         answer_all(results),
     )
@@ -212,7 +215,10 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
     if (loops := closed_loops(control)) is not None:
         value, reason = loops.gap
         undefined = f"The gap closed is not defined: {reason.rstrip('.')}."
-        after["control"] = (*((undefined,) if value is None else ()), *oracle_words(loops))
+        after["control"] = (
+            *((undefined,) if value is None and loops.has_oracle else ()),
+            *oracle_words(loops),
+        )
     else:
         timed = "" if isinstance(control, Absent) else " Instead, the controller was timed on recordings."
         if not isinstance(on_model, Absent) and on_model.plants:
@@ -234,12 +240,14 @@ def _notes(context: Context, results: Results) -> tuple[Notes, Notes]:
         *(f"Warning: {text}" for text in results.data.warnings),
         *(f"Note: {text}" for text in results.data.notes),
     )
-    replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
-    lacking = "mopgrnn" not in models_of(context.scenario.prior())
-    after["training"] = (
-        *((f"There is no MOPGRNN: {NO_BALANCE}.",) if lacking else ()),
-        *((f"{FADED} (prior_replay, weight {replay:g}).",) if replay else ()),
-    )
+    if kinds := trained_kinds(context):
+        replay = training_settings(context, context.read(CHOICE).deployed).prior_replay
+        after["training"] = (
+            *((f"There is no MOPGRNN: {NO_BALANCE}.",) if "mopgrnn" not in kinds else ()),
+            *((f"{FADED} (prior_replay, weight {replay:g}).",) if replay else ()),
+        )
+    else:
+        instead["training"] = ("This run trains no networks, so the hybrid equals the fitted prior.",)
     if context.prior.fit.warnings:
         after["models"] = ("Warnings of the fit: " + "; ".join(context.prior.fit.warnings) + ".",)
     watched, analysis = results.watch, results.analysis
@@ -371,7 +379,7 @@ def _prior_table(context: Context) -> Table:
 def _free_run_tables(context: Context) -> list[Table]:
     """Errors of every model: by output; then of its rates and by balance; the choice, and the bands."""
     prior, found = context.scenario.prior(), context.read(EVALUATION)
-    models = {name_of(m): found.scores[m].model for m in models_of(prior)}
+    models = {name_of(m): found.scores[m].model for m in models_of(context)}
     outputs = [s.label for s in prior.outputs]
     base = finite(found.scores["phy"].model.error)
     errors: dict[str, OutputErrors] = {**models}
@@ -457,18 +465,25 @@ def _export_table(export: ExportResult) -> Table:
 
 def _control_table(found: ControlResult) -> Table:
     names = [n for n in CONTROLLERS if any(n in cells for cells in found.means.values())]
+    gaps = found.gaps if found.gap[0] is not None else {}
     rows = []
     for task, cells in found.means.items():
-        gap, _ = found.gaps[task]
         costs = (_cost(cells.get(name)) for name in names)
-        rows.append((task, *costs, "–" if gap is None else f"{gap:.2f}"))
+        shares = ("–" if gap is None else f"{gap:.2f}" for gap in ([gaps[task][0]] if gaps else ()))
+        rows.append((task, *costs, *shares))
     caption = (
         "Closed-loop cost J on the true state: sum of the squared deviations of all signals, weighted as in the "
         "control problem. Mean over the seeds with a 95 % interval that holds with early stopping (no interval for "
-        "one seed). Gap closed: share of the distance from the better baseline to the measuring oracle that the "
-        "hybrid with observer covers; a dash if baseline and oracle do not differ significantly."
+        "one seed)."
     )
-    return Table(("task", *(n.replace("_", ", ") for n in names), "gap closed"), rows, caption)
+    if gaps:
+        caption += (
+            " Gap closed: share of the distance from the better baseline to the measuring oracle that the hybrid with "
+            "observer covers; a dash if baseline and oracle do not differ significantly."
+        )
+    return Table(
+        ("task", *(n.replace("_", ", ") for n in names), *(["gap closed"] if gaps else ())), rows, caption
+    )
 
 
 def _comparison_table(found: ControlResult) -> Table:

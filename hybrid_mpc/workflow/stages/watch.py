@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import poisson
 
-from hybrid_mpc.compare.loops import MODEL, Bench, LoopSpec, ModeChange
+from hybrid_mpc.compare.loops import MODEL, LoopSpec, ModeChange
 from hybrid_mpc.compare.nominal import CONTROLLER, broken, nominal_loops, nominal_tasks, stage_of
+from hybrid_mpc.compare.watched import Faulted, faulted, readings_of, traces_of
+from hybrid_mpc.engine import WORKERS, run_jobs
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.kit.assembly import sensor_steps
@@ -24,12 +26,12 @@ from hybrid_mpc.rules import counted, two_digits
 from hybrid_mpc.scenario import Scenario
 from hybrid_mpc.watch.detector import WatchLimits
 from hybrid_mpc.watch.diagnose import Diagnoser
-from hybrid_mpc.watch.explain import Alarm, WatchedRecording, begun, explained
+from hybrid_mpc.watch.explain import Alarm, WatchedRecording, explained
 from hybrid_mpc.watch.learn import limits_of
 from hybrid_mpc.watch.lengths import rest_speeds
-from hybrid_mpc.watch.monitor import Monitor, make_readings, reads_energy
-from hybrid_mpc.watch.readings import ENERGY, RESIDUALS, Channel
-from hybrid_mpc.watch.replay import Trace, TrajectoryLike, along, replay, stretches
+from hybrid_mpc.watch.monitor import reads_energy
+from hybrid_mpc.watch.readings import ENERGY, RESIDUALS, Channel, Readings
+from hybrid_mpc.watch.replay import Trace, TrajectoryLike, stretches, with_alarms
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stage import Absent, Stage
 from hybrid_mpc.workflow.stages.compare import run_or_read, what_loops_read
@@ -231,8 +233,6 @@ def watch_stage(context: Context) -> WatchResult | Absent:
     context.read(NOISE)
     kit, parts = context.kit, read_parts(context.out / "model")
     loops = _loop_data(context) if scenario.plant is not None and _calm(context) else None
-    watch: dict[str, WatchFile] = {}
-    sources: dict[str, str] = {}
     energy = reads_energy(kit.models["hybrid"])
     rest: tuple[float, ...] = ()
     reasons = []
@@ -242,33 +242,44 @@ def watch_stage(context: Context) -> WatchResult | Absent:
             rest = rest_speeds(nominal, kit.models["hybrid"])
         except InputError as short:
             reasons.append(f"no rest speeds: {short}")
-    others = [name for name in ("hybrid", "prior") if name != kit.recommended]
-    for name in (*others, kit.recommended):
+    kinds = (ENERGY, RESIDUALS) if energy else (RESIDUALS,)
+    kind, replayed = kinds[0], Replays(context, rest or kit.known_rest)
+    loops = loops if energy else None
+    recorded = kinds if loops is None else (RESIDUALS,)
+    names = (*(name for name in ("hybrid", "prior") if name != kit.recommended), kit.recommended)
+    held = _recorded(context, HELD).records
+    replayed.all(
+        *((name, (ENERGY,), loops.records) for name in names if loops is not None),
+        *((name, recorded, held) for name in names[:-1]),
+        (names[-1], kinds, context.dataset.whole),
+    )
+    watch: dict[str, WatchFile] = {}
+    sources: dict[str, str] = {}
+    for name in names:
         limits: dict[str, WatchLimits] = {}
         missing = list(reasons)
-        for kind in (ENERGY, RESIDUALS) if energy else (RESIDUALS,):
-            data = loops if kind == ENERGY else None
+        for one in kinds:
             try:
-                limits[kind], sources[kind] = _learned(context, kit, name, kind, rest or kit.known_rest, data)
+                limits[one], sources[one] = _learned(
+                    context, replayed, name, one, loops if one == ENERGY else None
+                )
             except InputError as none:
-                missing.append(f"limits of {kind} could not be learned: {none} [HM-WORKFLOW-044]")
+                missing.append(f"limits of {one} could not be learned: {none} [HM-WORKFLOW-044]")
         watch[name] = WatchFile(limits, "; ".join(missing), rest, parts.observer(name))
     write_watch(context.out / "model", watch)
     kit = context.kit
-    kind = ENERGY if energy else RESIDUALS
     wanted = rates(scenario, kit.models[kit.recommended])[0]
-    used = () if loops is None or not energy else loops.loops
+    used = () if loops is None else loops.loops
     found = WatchResult(watch, kind, sources, loops=used, wanted=wanted)
     if found.limits is None:
         return replace(found, reason=watch[kit.recommended].reason)
-    found = _on_recordings(context, kit, found)
+    found = _on_recordings(context, kit, found, replayed.of(kit.recommended, kind, context.dataset.whole))
     if scenario.plant is None:
         return replace(found, faults_reason=f"scenario {scenario.name} has no plant to simulate faults with")
     if not _calm(context):
         return replace(found, faults_reason=f"scenario {scenario.name} has no task without faults")
     if kind not in watch["hybrid"].limits:
         return replace(found, faults_reason=watch["hybrid"].reason)
-    context.progress.update("faults", 0, 1, "loops with simulated faults")
     return _faulted(context, kit, found)
 
 
@@ -282,27 +293,74 @@ def _calm(context: Context) -> bool:
     return any(not task.faults for task in context.scenario.tasks)
 
 
+class Replays:
+    """Traces of the models' monitors without limits, each computed once, in parallel processes.
+
+    Args:
+        context: The run.
+        rest: Speeds below which friction may stick; None: unknown.
+    """
+
+    def __init__(self, context: Context, rest: tuple[float, ...] | None) -> None:
+        self._context, self._rest = context, rest
+        self._kit = context.kit
+        self._traces: dict[tuple[str, str, int], Trace] = {}
+        self._kept: list[TrajectoryLike] = []  # so that no id is used twice
+
+    def all(self, *wanted: tuple[str, Sequence[str], Sequence[TrajectoryLike]]) -> None:
+        """Compute the missing traces of ``(model, kinds, records)``; a kind that a model cannot read is left out."""
+        folder = (self._context.out / "model").resolve()
+        jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
+        of: dict[str, tuple[str, int]] = {}
+        for name, kinds, records in wanted:
+            readable = [kind for kind in kinds if self._readable(name, kind)]
+            for record in records:
+                own = [kind for kind in readable if (name, kind, id(record)) not in self._traces]
+                if own:
+                    job = f"{name}, {getattr(record, 'name', len(jobs))}"
+                    of[job] = name, id(record)
+                    jobs[job] = traces_of, (folder, self._kit.loop, name, own, self._rest, record)
+                    self._kept.append(record)
+        found = run_jobs(
+            jobs, self._context.progress.update, WORKERS, fresh=False, cluster=self._context.cluster
+        )
+        for job, (name, record_id) in of.items():
+            self._traces |= {(name, kind, record_id): trace for kind, trace in found[job].items()}
+
+    def of(self, name: str, kind: str, records: Sequence[TrajectoryLike]) -> list[Trace]:
+        """Traces of a model's readings of a kind; InputError if the model has no such readings."""
+        self.readings(name, kind)
+        self.all((name, (kind,), records))
+        return [self._traces[name, kind, id(record)] for record in records]
+
+    def readings(self, name: str, kind: str) -> Readings:
+        """The readings of a kind; InputError if the model has none, or no estimator."""
+        self._kit.observer(name)
+        return readings_of(self._kit, name, kind, self._rest)
+
+    def _readable(self, name: str, kind: str) -> bool:
+        try:
+            self.readings(name, kind)
+        except InputError:
+            return False
+        return True
+
+
 def _learned(
-    context: Context, kit: Kit, name: str, kind: str, rest: tuple[float, ...] | None, data: Data | None
+    context: Context, replayed: Replays, name: str, kind: str, data: Data | None
 ) -> tuple[WatchLimits, str]:
     """Limits of a model's readings, and a description of the data that they were learned from.
 
     Without ``data``, held-out recordings are used if they suffice, else all undisturbed recordings.
     """
-    model, estimator = kit.models[name], kit.observer(name)
-    readings = make_readings(model, kind, rest_speed=rest)
+    readings, kit = replayed.readings(name, kind), context.kit
     resolution = sensor_steps(kit.sensor_sigma) if kind == ENERGY else None
-    traces: dict[int, Trace] = {}
 
     def from_data(data: Data) -> tuple[WatchLimits, str]:
-        monitor = Monitor(readings)
-        new = [r for r in data.records if id(r) not in traces]
-        for record, say in along(new, context.progress.update):
-            traces[id(record)] = replay(monitor, estimator, record, on_progress=say)
-        own = [traces[id(record)] for record in data.records]
         limits = limits_of(
-            readings, [r.y for r in data.records], own, false_alarms_per_hour=rates(context.scenario, model),
-            nominal=data.masks, resolution=resolution, data_hash=data.data_hash,
+            readings, [r.y for r in data.records], replayed.of(name, kind, data.records),
+            false_alarms_per_hour=rates(context.scenario, kit.models[name]), nominal=data.masks,
+            resolution=resolution, data_hash=data.data_hash,
         )  # fmt: skip
         return limits, data.source
 
@@ -345,8 +403,8 @@ def _loop_data(context: Context) -> Data:
     return Data(records, masks, source, content.hexdigest(), tuple(loops))
 
 
-def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
-    """Monitor whole recordings: all alarms, false alarms, and traces for the figures."""
+def _on_recordings(context: Context, kit: Kit, found: WatchResult, replayed: Sequence[Trace]) -> WatchResult:
+    """Monitor whole recordings by their traces: all alarms, false alarms, and traces for the figures."""
     whole, monitor, estimator = context.dataset.whole, kit.monitor(), kit.observer()
     made: list[Diagnoser] = []
 
@@ -355,8 +413,10 @@ def _on_recordings(context: Context, kit: Kit, found: WatchResult) -> WatchResul
         return made[0]
 
     traces, rows = [], []
-    for recording, say in along(whole, context.progress.update):
-        trace, own = explained(monitor, estimator, recording, diagnoser, say)
+    for recording, plain in zip(whole, replayed, strict=True):
+        trace, own = with_alarms(monitor, plain), tuple[Alarm, ...]()
+        if trace.alarm.any():  # a diagnosis needs the estimates
+            trace, own = explained(monitor, estimator, recording, diagnoser)
         traces.append(trace)
         seconds = len(recording.t) * recording.dt
         rows.append(WatchedRecording(recording.name, seconds, **trace.coverage(recording.dt), alarms=own))
@@ -386,40 +446,30 @@ def _faulted(context: Context, kit: Kit, found: WatchResult) -> WatchResult:
     If the scenario declares a safe input, a guard switches to it when a sensor freezes.
     """
     scenario, settings = context.scenario, context.settings
-    bench, model, task = Bench(scenario, {MODEL: kit}), kit.models["hybrid"], nominal_tasks(scenario)[0]
+    model, task, folder = kit.models["hybrid"], nominal_tasks(scenario)[0], (context.out / "model").resolve()
     start = model.dt * round(0.5 * task.duration / model.dt)
     guard = "rest" if scenario.safe_input is not None else ""
     base = LoopSpec(
         settings.scenario, MODEL, task.name, CONTROLLER, monitor="guard", guard=guard, seed=FAULT_SEED,
         run_seed=settings.seed,
     )  # fmt: skip
-    loops, arrays, tried = [], dict(found.arrays), broken(scenario, model, bench.problem(base), start)
-    for i, case in enumerate(tried):
-        context.progress.update("faults", i, len(tried), case.title)
-        spec = replace(base, faults=(case.fault,))
-        row, result = bench.run(spec)
-        # the estimator is deterministic: a replay of the record repeats its estimates in the loop
-        trace, alarms = explained(
-            kit.monitor("hybrid", task=task.name),
-            bench.parts(spec)[0],
-            result,
-            lambda: kit.diagnoser("hybrid"),
-        )
-        before, seen = begun(alarms, start)
+    tried = broken(scenario, model, kit.problem(task.name), start)
+    jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        case.name: (
+            faulted, (context.scenario_path, folder, replace(base, faults=(case.fault,)), start)
+        ) for case in tried
+    }  # fmt: skip
+    ran = run_jobs(jobs, context.progress.update, WORKERS, fresh=False, cluster=context.cluster)
+    loops, arrays = [], dict(found.arrays)
+    for case in tried:
+        one: Faulted = ran[case.name]
         loops.append(
             FaultedLoop(
-                fault=case.name,
-                title=case.title,
-                task=task.name,
-                start_s=start,
-                delay_s=seen[0].start_s - start if seen else None,
-                channels=seen[0].channels if seen else (),
-                diagnosis=seen[0].diagnosis if seen else "",
-                false_alarms=len(before),
-                switches=tuple(row.switches),
+                case.name, case.title, task.name, start, one.delay_s, one.channels, one.diagnosis,
+                one.false_alarms, one.switches,
             )
-        )
-        arrays |= trace_arrays(case.name, trace, result.y)
+        )  # fmt: skip
+        arrays |= trace_arrays(case.name, one.trace, one.y)
     return replace(found, faults=tuple(loops), arrays=arrays)
 
 
