@@ -117,6 +117,10 @@ CARRIES = 0.95
 MODULUS = 0.5
 """Least distance of the Nyquist curve from -1: peak sensitivity 2, gain margin 2, phase margin 29 degrees (Astrom and
 Hagglund, *Advanced PID Control*, 2006, section 4.6)."""
+INWARD = (
+    "Move the bound inwards, or raise its penalty (docs/bounds.md#soft-or-hard). No start may violate it."
+)
+"""Remedy for a bound that the run's loops violate."""
 SOFTER = "Increase the weights of changes (r_delta), or reduce the process noise; hybrid-mpc analyze shows details."
 BY_NETWORK = (
     "The network's slope at the set-point reduces this margin: record small motions about the set-point and run again. "
@@ -126,6 +130,8 @@ BY_NETWORK = (
 """Remedies for small margins: ``SOFTER`` for any loop, ``BY_NETWORK`` if the prior's margins are larger."""
 HALF = 0.5
 """Share of the period that 99 % of the steps may take: sensors, actuator and other work need the rest."""
+VIOLATES = 4.0
+"""Largest violation of a bound within the noise, in standard deviations: about the largest of 10,000 samples."""
 NEAR = 0.05
 """Distance of a start from a hard bound, as a share of the distance from the set-point to the bound."""
 WHITE = 0.3
@@ -835,14 +841,20 @@ def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
 
 
 def limits(
-    points: Sequence[SetPoint], trials: Sequence[Trial], given_way: Mapping[str, Mapping[str, float]]
+    points: Sequence[SetPoint],
+    trials: Sequence[Trial],
+    given_way: Mapping[str, Mapping[str, float]],
+    violation: tuple[float, str] = (0.0, ""),
 ) -> Promise:
-    """Row "limits": whether the controller finds a plan within the hard bounds in every period.
+    """Row "limits": whether the controller finds a plan within the hard bounds in every period, and whether the run's
+    loops violate bounds of states and outputs by more than the noise.
 
     Args:
         points: The set-points.
         trials: All trials.
         given_way: Share of the periods with a relaxed hard bound, by task of the run's loops and bound.
+        violation: The largest violation of a bound in the run's loops over the noise [-], and a text
+            (:func:`largest_violation`). Default: no loop was run.
     """
     name, model = "limits", points[0].model
     results = [one.result for one in trials]
@@ -864,20 +876,19 @@ def limits(
     failed = sum(source != Source.MPC.name for source in sources)
     if failed:
         found.append(f"{failed} of {len(sources)} solves failed, so the safeguard computed the input")
+    beyond, largest = violation
+    remedy = "Widen the bounds, use a longer horizon, or a terminal set (HardBound(..., at_end=True))."
+    if beyond > VIOLATES:
+        remedy = remedy if found else INWARD
+        found.append(largest)
     if found:
-        return Promise(
-            name, "doubted", "; ".join(found),
-            "Widen the bounds, use a longer horizon, or a terminal set (HardBound(..., at_end=True)).",
-        )  # fmt: skip
+        return Promise(name, "doubted", "; ".join(found), remedy)
     ends = [bound for point in hard for bound in point.problem.hard if bound.at_end]
     if not hard:
+        evidence = f"every period has a plan within the inputs' limits ({len(sources)} periods tested)"
         soft = any(_is_soft(point.problem) for point in points)
-        evidence = "the bounds of states and outputs are soft" if soft else "only inputs are bounded"
-        return Promise(
-            name,
-            "shown",
-            f"{evidence}; every period has a plan within the inputs' limits ({len(sources)} periods tested)",
-        )
+        bounds = f"bounds of states and outputs are soft; {largest}" if soft else "only inputs are bounded"
+        return Promise(name, "shown", f"{evidence}; {bounds}")
     evidence = (
         f"no hard bound is relaxed from {counted(len(starts), 'start')} within {100 * NEAR:.0f} % of a bound"
     )
@@ -886,6 +897,34 @@ def limits(
         "shown",
         evidence + (", and the plan has a terminal set" if ends else " (simulation, not a proof)"),
     )
+
+
+def largest_violation(
+    point: SetPoint, excess: Mapping[str, Mapping[str, float]], where: str = ""
+) -> tuple[float, str]:
+    """The largest violation of a bound of a state or output over the noise [-], and a text.
+
+    The noise of a state is the larger one of its process noise per period and its sensor's noise.
+
+    Args:
+        point: A set-point of the kit.
+        excess: Largest violation by task and signal (:attr:`~hybrid_mpc.compare.loops.LoopRow.excess`).
+        where: Text that names the plant of the loops. Default: empty.
+    """
+    model, sigma = point.model, dict(zip([s.name for s in point.model.outputs], point.sigma, strict=True))
+    process = np.maximum(
+        np.sqrt(quiet(point.estimator).noise[0][: model.n_x]), ROUNDING * Sizes(model, point.problem).states
+    )
+    noise = {f"output {s.label}": sigma[s.name] for s in model.outputs}
+    noise |= {s.label: max(q, sigma.get(s.name, q)) for s, q in zip(model.states, process, strict=True)}
+    found = [(-1.0, "no loop of the run tested them")]
+    for task, by_signal in excess.items():
+        for label in by_signal.keys() & noise:
+            name, _, unit = label.rstrip("]").rpartition(" [")
+            text = f"largest violation in the run's loops: {by_signal[label]:.2g} {unit} of {name} in task {task}"
+            text += f" {where} (noise {noise[label]:.2g} {unit})"
+            found.append((float(by_signal[label] / noise[label]), text))
+    return max(found)
 
 
 def _is_soft(problem: OCP) -> bool:
@@ -1132,6 +1171,7 @@ def examine(
     ends: Sequence[TaskEnd] = (),
     where: str = "",
     given_way: Mapping[str, Mapping[str, float]] | None = None,
+    excess: Mapping[str, Mapping[str, float]] | None = None,
     tested: Tested | str = "no test recording was examined",
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> tuple[Promise, ...]:
@@ -1143,6 +1183,7 @@ def examine(
         ends: Deviations at the ends of tasks in the run's loops. Default: none.
         where: Text that names the plant of these loops.
         given_way: Share of their periods with a relaxed hard bound, by task and bound. Default: none.
+        excess: Their largest violation of bounds, by task and signal. Default: none.
         tested: Statistics of the innovations on recordings, or why there are none.
         report: Called with ``(done, total, text)``. Default: no report.
 
@@ -1183,7 +1224,7 @@ def examine(
         tasks_end(ends, where),
         time,
         *of_model,
-        limits(points, own, given_way or {}),
+        limits(points, own, given_way or {}, largest_violation(points[0], excess or {}, where)),
         *of_observer,
         disturbance_model(points, [trials[0] for trials in every]),
     )

@@ -231,7 +231,9 @@ def fit_prior(
         chosen = settled if after <= ENOUGH * before else chosen  # its updated weights may favour one output
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
-    answered = feedback([t.u for t in acting], smoother.prediction_errors(acting))
+    # a controller commands; acting inputs hold earlier commands, whose effects are in the errors if the delay is off
+    commanded = [t.u[-len(own.u) :] for t, own in zip(train, acting, strict=True)]
+    answered = feedback(commanded, smoother.prediction_errors(acting))
     if fit.free and (answered > 1.0 or fit.reach(chosen.theta) < length):
         on_progress(total - 1, total, PREDICTIONS)
         known = [replace(t, x=s.x) for t, s in zip(acting, smoother.smooth(acting), strict=True)]

@@ -350,6 +350,19 @@ def test_a_hard_bound_that_no_plan_keeps_is_a_doubt():
     assert (told.verdict, "2 % of the periods" in told.evidence) == ("doubted", True)
 
 
+@pytest.mark.parametrize(("beyond", "verdict"), [(0.03, "shown"), (0.2, "doubted")])
+@pytest.mark.parametrize("label", ["level [m]", "output level [m]"])
+def test_a_violation_of_a_soft_bound_beyond_the_noise_is_a_doubt(label, beyond, verdict):
+    problem = OCP(20, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0], x_max=[0.5], y_max=[0.5])
+    point = point_of(kit_of(tank(), problem))
+    excess = {"step": {label: 0.001, "valve [m/s]": 9.0}, "hold": {label: beyond}}
+    row = p.limits([point], [], {}, p.largest_violation(point, excess, "on the plant"))
+    name = label.removesuffix(" [m]")
+    assert f"{beyond} m of {name} in task hold on the plant (noise 0.01 m)" in row.evidence
+    assert (row.verdict, bool(row.remedy)) == (verdict, verdict == "doubted")
+    assert "no loop" in p.limits([point], [], {}, p.largest_violation(point, {})).evidence
+
+
 def test_a_loop_that_leaves_its_ranges_gives_one_row_and_a_horizon_that_holds_it():
     """An unstable machine with a horizon over which errors grow 10^10 times: every solve fails."""
     unstable, weights = tank(a=1.5), ([0.0], [0.0], [0.1], [-1.0], [1.0])
