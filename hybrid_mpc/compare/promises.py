@@ -122,6 +122,13 @@ INWARD = (
 )
 """Remedy for a bound that the run's loops violate."""
 SOFTER = "Increase the weights of changes (r_delta), or reduce the process noise; hybrid-mpc analyze shows details."
+LATE = (
+    "Increase the weights of changes (r_delta) 10 to 100 times, or model the delay: by a state with the actuator's "
+    "lag, or by largest_delay of the data (docs/clocks.md#known-delays)."
+)
+"""Remedy for a loop that does not settle with late inputs."""
+LATE_INPUTS = "late inputs"
+"""Name of the row on late inputs."""
 BY_NETWORK = (
     "The network's slope at the set-point reduces this margin: record small motions about the set-point and run again. "
     "Start on the machine with small steps, and compare with the prior's loop (hybrid-mpc control --controller "
@@ -483,12 +490,14 @@ def trial(point: SetPoint, draw: int, periods: int) -> Trial:
     return tried(point, plant, x, periods, draw)
 
 
-def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int = 0) -> Trial:
-    """A loop of the kit's parts on a plant, from a state ``(n_x,)``; durations are processor time."""
+def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int = 0, late: int = 0) -> Trial:
+    """A loop of the kit's parts on a plant, from a state ``(n_x,)``, with inputs ``late`` by so many periods; durations
+    are processor time.
+    """
     model = point.model
     result = simulate(
         plant, point.estimator, point.controller, point.reference, dt=model.dt, duration=periods * model.dt, x0=x0,
-        seed=seed, w=point.w if model.n_w else None, now=thread_time,
+        seed=seed, w=point.w if model.n_w else None, now=thread_time, input_delay=late,
     )  # fmt: skip
     before = np.vstack([result.u[:1], result.u[:-1]])
     errors = point.errors(result.y, before)
@@ -837,6 +846,47 @@ def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
     return min(found, default=None)
 
 
+def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
+    """Row "late inputs": a loop on the model itself, with inputs that act later than in the model.
+
+    It starts beside the set-point, by the spread of the controlled outputs in the recordings.
+
+    The linearized loop shows small motions alone: at the limits of the inputs, a large motion can start swings that
+    never end.
+
+    Args:
+        point: The set-point.
+        lacking_s: Delay [s] that the recordings show and the model lacks. Default: none; then one period.
+
+    Returns:
+        None if the loop does not settle without a delay either: other rows name the reason.
+    """
+    model, (x, u) = point.model, point.rest
+    slopes = output_with_jacobian(model)(x, u, point.w)[1].full()[point.held]
+    sizes = point.controller.controller.problem.sizes
+    spreads = sizes.natural_outputs
+    # the smallest deviation of the states, over their sizes, that moves the outputs by their spreads
+    start = x - sizes.natural * (np.linalg.pinv(slopes * sizes.natural) @ spreads[point.held])
+    start = np.clip(start, *np.array([(s.lower, s.upper) for s in model.states]).T)
+    late, periods = max(1, math.ceil(lacking_s / model.dt - ROUNDING)), LASTS * point.problem.horizon
+    plant = ModelPlant(model, tuple(point.sigma))
+    if tried(point, plant, start, periods).why:
+        return None
+    sizes_of = zip(point.held, np.abs(slopes @ (start - x)), strict=True)
+    moved = ", ".join(
+        f"{model.outputs[i].name} by {size:.2g} {model.outputs[i].unit}" for i, size in sizes_of
+    )
+    told = (
+        "" if not lacking_s else f"; in the recordings inputs act {lacking_s:.2g} s later than in the prior"
+    )
+    found = tried(point, plant, start, periods, late=late)
+    when = f"after a deviation ({moved}) with inputs {counted(late, 'period')} late"
+    if not found.why:
+        return Promise(LATE_INPUTS, "shown", f"the loop on the model itself settles {when}{told}")
+    evidence = f"the loop on the model itself does not settle {when}: {found.worst}{told}"
+    return Promise(LATE_INPUTS, "doubted", evidence, LATE)
+
+
 # Limits.
 
 
@@ -1173,6 +1223,7 @@ def examine(
     given_way: Mapping[str, Mapping[str, float]] | None = None,
     excess: Mapping[str, Mapping[str, float]] | None = None,
     tested: Tested | str = "no test recording was examined",
+    lacking_delay: float = 0.0,
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> tuple[Promise, ...]:
     """Examine all promises of a kit.
@@ -1185,6 +1236,7 @@ def examine(
         given_way: Share of their periods with a relaxed hard bound, by task and bound. Default: none.
         excess: Their largest violation of bounds, by task and signal. Default: none.
         tested: Statistics of the innovations on recordings, or why there are none.
+        lacking_delay: Delay of the inputs [s] that the recordings show and the prior lacks. Default: none.
         report: Called with ``(done, total, text)``. Default: no report.
 
     Raises:
@@ -1218,12 +1270,14 @@ def examine(
     if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer)
     elsewhere = loads_elsewhere(kit, points[0])
+    late = late_inputs(points[0], lacking_delay)
     return (
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
         *([] if elsewhere is None else [elsewhere]),
         tasks_end(ends, where),
         time,
         *of_model,
+        *([] if late is None else [late]),
         limits(points, own, given_way or {}, largest_violation(points[0], excess or {}, where)),
         *of_observer,
         disturbance_model(points, [trials[0] for trials in every]),

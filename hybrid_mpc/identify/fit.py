@@ -247,13 +247,14 @@ def fit_prior(
             smoother = smoother_of(chosen)
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     warnings = warnings_of(fit, chosen, answered, min(scores) / max(scores[0], 1e-300))
+    lacking, late = 0.0, tuple[str, ...]()
     if fit.free and not largest_delay and first_states.kind not in ("known", "shared"):
-        warnings += late_inputs(fit, chosen.theta, guesses, periods, sizes, first_states)
+        lacking, late = late_inputs(fit, chosen.theta, guesses, periods, sizes, first_states)
     on_progress(total, total, "done")
     return PriorFit(
         values=fit.values(chosen.theta),
         standard_errors=standard_errors(fit, chosen),
-        warnings=warnings,
+        warnings=(*warnings, *late),
         stages=stages,
         correlations=correlations(fit, chosen),
         delay=fit.delay(chosen.theta),
@@ -263,6 +264,7 @@ def fit_prior(
         fading=smoother.fading,
         substeps=smoother.substeps,
         unidentified=chosen.unidentified,
+        lacking_delay=lacking,
     )
 
 

@@ -54,6 +54,7 @@ def promises_stage(context: Context) -> PromiseTable | Absent:
     found = examine(
         kit, tasks, ends=tuple(ends.values()), where=where, given_way=given_way, excess=excess,
         tested=_tested(context, controller, kit.models[kit.recommended].n_y),
+        lacking_delay=context.prior.fit.lacking_delay,
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
     of_prior = structure(context.prior, context.read(CHOICE).choice, found_terms(context))
