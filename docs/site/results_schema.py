@@ -58,6 +58,7 @@ VERSIONS = """## Versions
 
 | version | differs from the one before |
 | --- | --- |
+| 14 | "lacking_delay" in "prior.fit" |
 | 13 | modes in "analysis", "nis_band" in "estimation", alarms by recording in "watch"; no "plants" in "on_model" |
 | 12 | has the stages' own dataclasses; rows of all loops in place of their means |
 | 11 | has "watch" in place of "residuals", "monitor" and "guard" |

@@ -571,7 +571,7 @@ class _Judge:
                 self.found.setdefault(trait.full, Verdict("output", "not commanded"))
                 continue
             # a column that no input affects is no output of the machine; an angle is always taken as an output
-            strongest = max((self.links.of(trait, t) for t in outputs), default=0.0)
+            strongest = max((self.links.of(trait, t, beside=inputs) for t in outputs), default=0.0)
             free = turn_in(trait.unit) is None and all(
                 self.links.of(t, trait) < max(QUIET, strongest / STRONGER) for t in inputs
             )
@@ -582,11 +582,8 @@ class _Judge:
             if moved and back < max(QUIET, there / LEADS):
                 known = trait.unit and trait.unit not in REACHED_UNITS
                 alike = next((t.full for t in inputs if known and t.unit == trait.unit), "")
-                if (trait.unit in DRIVING_UNITS or alike) and trait.whole and trait.said == "":
-                    unit = (
-                        f"has the unit of {alike!r}" if alike else f"{trait.unit} is a typical unit of inputs"
-                    )
-                    self._say(trait, "input", f"affects outputs, and {unit}", False)
+                if alike and trait.whole and trait.said == "":
+                    self._say(trait, "input", f"affects outputs, and has the unit of {alike!r}", False)
                 else:
                     self._say(
                         trait, "disturbance", "affects outputs, and no input affects this column", False

@@ -117,7 +117,18 @@ CARRIES = 0.95
 MODULUS = 0.5
 """Least distance of the Nyquist curve from -1: peak sensitivity 2, gain margin 2, phase margin 29 degrees (Astrom and
 Hagglund, *Advanced PID Control*, 2006, section 4.6)."""
+INWARD = (
+    "Move the bound inwards, or raise its penalty (docs/bounds.md#soft-or-hard). No start may violate it."
+)
+"""Remedy for a bound that the run's loops violate."""
 SOFTER = "Increase the weights of changes (r_delta), or reduce the process noise; hybrid-mpc analyze shows details."
+LATE = (
+    "Increase the weights of changes (r_delta) 10 to 100 times, or model the delay: by a state with the actuator's "
+    "lag, or by largest_delay of the data (docs/clocks.md#known-delays)."
+)
+"""Remedy for a loop that does not settle with late inputs."""
+LATE_INPUTS = "late inputs"
+"""Name of the row on late inputs."""
 BY_NETWORK = (
     "The network's slope at the set-point reduces this margin: record small motions about the set-point and run again. "
     "Start on the machine with small steps, and compare with the prior's loop (hybrid-mpc control --controller "
@@ -126,6 +137,8 @@ BY_NETWORK = (
 """Remedies for small margins: ``SOFTER`` for any loop, ``BY_NETWORK`` if the prior's margins are larger."""
 HALF = 0.5
 """Share of the period that 99 % of the steps may take: sensors, actuator and other work need the rest."""
+VIOLATES = 4.0
+"""Largest violation of a bound within the noise, in standard deviations: about the largest of 10,000 samples."""
 NEAR = 0.05
 """Distance of a start from a hard bound, as a share of the distance from the set-point to the bound."""
 WHITE = 0.3
@@ -477,12 +490,14 @@ def trial(point: SetPoint, draw: int, periods: int) -> Trial:
     return tried(point, plant, x, periods, draw)
 
 
-def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int = 0) -> Trial:
-    """A loop of the kit's parts on a plant, from a state ``(n_x,)``; durations are processor time."""
+def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int = 0, late: int = 0) -> Trial:
+    """A loop of the kit's parts on a plant, from a state ``(n_x,)``, with inputs ``late`` by so many periods; durations
+    are processor time.
+    """
     model = point.model
     result = simulate(
         plant, point.estimator, point.controller, point.reference, dt=model.dt, duration=periods * model.dt, x0=x0,
-        seed=seed, w=point.w if model.n_w else None, now=thread_time,
+        seed=seed, w=point.w if model.n_w else None, now=thread_time, input_delay=late,
     )  # fmt: skip
     before = np.vstack([result.u[:1], result.u[:-1]])
     errors = point.errors(result.y, before)
@@ -831,18 +846,65 @@ def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
     return min(found, default=None)
 
 
+def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
+    """Row "late inputs": a loop on the model itself, with inputs that act later than in the model.
+
+    It starts beside the set-point, by the spread of the controlled outputs in the recordings.
+
+    The linearized loop shows small motions alone: at the limits of the inputs, a large motion can start swings that
+    never end.
+
+    Args:
+        point: The set-point.
+        lacking_s: Delay [s] that the recordings show and the model lacks. Default: none; then one period.
+
+    Returns:
+        None if the loop does not settle without a delay either: other rows name the reason.
+    """
+    model, (x, u) = point.model, point.rest
+    slopes = output_with_jacobian(model)(x, u, point.w)[1].full()[point.held]
+    sizes = point.controller.controller.problem.sizes
+    spreads = sizes.natural_outputs
+    # the smallest deviation of the states, over their sizes, that moves the outputs by their spreads
+    start = x - sizes.natural * (np.linalg.pinv(slopes * sizes.natural) @ spreads[point.held])
+    start = np.clip(start, *np.array([(s.lower, s.upper) for s in model.states]).T)
+    late, periods = max(1, math.ceil(lacking_s / model.dt - ROUNDING)), LASTS * point.problem.horizon
+    plant = ModelPlant(model, tuple(point.sigma))
+    if tried(point, plant, start, periods).why:
+        return None
+    sizes_of = zip(point.held, np.abs(slopes @ (start - x)), strict=True)
+    moved = ", ".join(
+        f"{model.outputs[i].name} by {size:.2g} {model.outputs[i].unit}" for i, size in sizes_of
+    )
+    told = (
+        "" if not lacking_s else f"; in the recordings inputs act {lacking_s:.2g} s later than in the prior"
+    )
+    found = tried(point, plant, start, periods, late=late)
+    when = f"after a deviation ({moved}) with inputs {counted(late, 'period')} late"
+    if not found.why:
+        return Promise(LATE_INPUTS, "shown", f"the loop on the model itself settles {when}{told}")
+    evidence = f"the loop on the model itself does not settle {when}: {found.worst}{told}"
+    return Promise(LATE_INPUTS, "doubted", evidence, LATE)
+
+
 # Limits.
 
 
 def limits(
-    points: Sequence[SetPoint], trials: Sequence[Trial], given_way: Mapping[str, Mapping[str, float]]
+    points: Sequence[SetPoint],
+    trials: Sequence[Trial],
+    given_way: Mapping[str, Mapping[str, float]],
+    violation: tuple[float, str] = (0.0, ""),
 ) -> Promise:
-    """Row "limits": whether the controller finds a plan within the hard bounds in every period.
+    """Row "limits": whether the controller finds a plan within the hard bounds in every period, and whether the run's
+    loops violate bounds of states and outputs by more than the noise.
 
     Args:
         points: The set-points.
         trials: All trials.
         given_way: Share of the periods with a relaxed hard bound, by task of the run's loops and bound.
+        violation: The largest violation of a bound in the run's loops over the noise [-], and a text
+            (:func:`largest_violation`). Default: no loop was run.
     """
     name, model = "limits", points[0].model
     results = [one.result for one in trials]
@@ -864,20 +926,19 @@ def limits(
     failed = sum(source != Source.MPC.name for source in sources)
     if failed:
         found.append(f"{failed} of {len(sources)} solves failed, so the safeguard computed the input")
+    beyond, largest = violation
+    remedy = "Widen the bounds, use a longer horizon, or a terminal set (HardBound(..., at_end=True))."
+    if beyond > VIOLATES:
+        remedy = remedy if found else INWARD
+        found.append(largest)
     if found:
-        return Promise(
-            name, "doubted", "; ".join(found),
-            "Widen the bounds, use a longer horizon, or a terminal set (HardBound(..., at_end=True)).",
-        )  # fmt: skip
+        return Promise(name, "doubted", "; ".join(found), remedy)
     ends = [bound for point in hard for bound in point.problem.hard if bound.at_end]
     if not hard:
+        evidence = f"every period has a plan within the inputs' limits ({len(sources)} periods tested)"
         soft = any(_is_soft(point.problem) for point in points)
-        evidence = "the bounds of states and outputs are soft" if soft else "only inputs are bounded"
-        return Promise(
-            name,
-            "shown",
-            f"{evidence}; every period has a plan within the inputs' limits ({len(sources)} periods tested)",
-        )
+        bounds = f"bounds of states and outputs are soft; {largest}" if soft else "only inputs are bounded"
+        return Promise(name, "shown", f"{evidence}; {bounds}")
     evidence = (
         f"no hard bound is relaxed from {counted(len(starts), 'start')} within {100 * NEAR:.0f} % of a bound"
     )
@@ -886,6 +947,34 @@ def limits(
         "shown",
         evidence + (", and the plan has a terminal set" if ends else " (simulation, not a proof)"),
     )
+
+
+def largest_violation(
+    point: SetPoint, excess: Mapping[str, Mapping[str, float]], where: str = ""
+) -> tuple[float, str]:
+    """The largest violation of a bound of a state or output over the noise [-], and a text.
+
+    The noise of a state is the larger one of its process noise per period and its sensor's noise.
+
+    Args:
+        point: A set-point of the kit.
+        excess: Largest violation by task and signal (:attr:`~hybrid_mpc.compare.loops.LoopRow.excess`).
+        where: Text that names the plant of the loops. Default: empty.
+    """
+    model, sigma = point.model, dict(zip([s.name for s in point.model.outputs], point.sigma, strict=True))
+    process = np.maximum(
+        np.sqrt(quiet(point.estimator).noise[0][: model.n_x]), ROUNDING * Sizes(model, point.problem).states
+    )
+    noise = {f"output {s.label}": sigma[s.name] for s in model.outputs}
+    noise |= {s.label: max(q, sigma.get(s.name, q)) for s, q in zip(model.states, process, strict=True)}
+    found = [(-1.0, "no loop of the run tested them")]
+    for task, by_signal in excess.items():
+        for label in by_signal.keys() & noise:
+            name, _, unit = label.rstrip("]").rpartition(" [")
+            text = f"largest violation in the run's loops: {by_signal[label]:.2g} {unit} of {name} in task {task}"
+            text += f" {where} (noise {noise[label]:.2g} {unit})"
+            found.append((float(by_signal[label] / noise[label]), text))
+    return max(found)
 
 
 def _is_soft(problem: OCP) -> bool:
@@ -1132,7 +1221,9 @@ def examine(
     ends: Sequence[TaskEnd] = (),
     where: str = "",
     given_way: Mapping[str, Mapping[str, float]] | None = None,
+    excess: Mapping[str, Mapping[str, float]] | None = None,
     tested: Tested | str = "no test recording was examined",
+    lacking_delay: float = 0.0,
     report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> tuple[Promise, ...]:
     """Examine all promises of a kit.
@@ -1143,7 +1234,9 @@ def examine(
         ends: Deviations at the ends of tasks in the run's loops. Default: none.
         where: Text that names the plant of these loops.
         given_way: Share of their periods with a relaxed hard bound, by task and bound. Default: none.
+        excess: Their largest violation of bounds, by task and signal. Default: none.
         tested: Statistics of the innovations on recordings, or why there are none.
+        lacking_delay: Delay of the inputs [s] that the recordings show and the prior lacks. Default: none.
         report: Called with ``(done, total, text)``. Default: no report.
 
     Raises:
@@ -1177,13 +1270,15 @@ def examine(
     if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer)
     elsewhere = loads_elsewhere(kit, points[0])
+    late = late_inputs(points[0], lacking_delay)
     return (
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
         *([] if elsewhere is None else [elsewhere]),
         tasks_end(ends, where),
         time,
         *of_model,
-        limits(points, own, given_way or {}),
+        *([] if late is None else [late]),
+        limits(points, own, given_way or {}, largest_violation(points[0], excess or {}, where)),
         *of_observer,
         disturbance_model(points, [trials[0] for trials in every]),
     )

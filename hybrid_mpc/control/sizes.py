@@ -69,7 +69,7 @@ class Sizes:
     @cached_property
     def outputs(self) -> Array:
         """Sizes of the outputs ``(n_y,)``: natural ones, at most ``1 / sqrt(q_y)``; NaN for unknown ones."""
-        return np.fmin(self._natural_outputs, _tolerated(self._ocp.q_y) if self._ocp.n_y else np.nan)
+        return np.fmin(self.natural_outputs, _tolerated(self._ocp.q_y) if self._ocp.n_y else np.nan)
 
     def values(self, f: ca.Function) -> Array:
         """Sizes of the values of ``f(x, u, e)``, a column ``(n,)``: how far they move when states and inputs move by
@@ -78,7 +78,7 @@ class Sizes:
         m, around = self._model, np.zeros(f.numel_in(2))
         around[m.n_d : m.n_d + m.n_w] = m.w[: max(around.size - m.n_d, 0)]
         point = np.concatenate([m.x0, self._held])
-        size = np.concatenate([np.fmax(self._natural, self.states), self._ocp.input_scale])
+        size = np.concatenate([np.fmax(self.natural, self.states), self._ocp.input_scale])
         steps = size * np.vstack(
             [np.eye(size.size), np.random.default_rng(0).uniform(0.5, 1.0, (RUNS, size.size))]
         )
@@ -96,19 +96,20 @@ class Sizes:
         tolerated deviation.
         """
         ocp = self._ocp
-        parts = [ocp.q * self._natural**2, (ocp.r + ocp.r_delta) * ocp.input_range**2]
-        parts += [ocp.q_y * self._natural_outputs**2] if ocp.n_y else []
+        parts = [ocp.q * self.natural**2, (ocp.r + ocp.r_delta) * ocp.input_range**2]
+        parts += [ocp.q_y * self.natural_outputs**2] if ocp.n_y else []
         return float(np.nanmax(np.concatenate([[1.0], *parts])))
 
     @cached_property
-    def _natural(self) -> Array:
+    def natural(self) -> Array:
         """Natural sizes of the states ``(n_x,)``; NaN for unknown ones."""
         m = self._model
         known = _known(m.state_spread, [s.upper - s.lower for s in m.states])
         return np.where(np.isnan(known), self._moved, known) if np.any(np.isnan(known)) else known
 
     @cached_property
-    def _natural_outputs(self) -> Array:
+    def natural_outputs(self) -> Array:
+        """Natural sizes of the outputs ``(n_y,)``; NaN for unknown ones."""
         m = self._model
         known = _known(m.output_spread, [s.upper - s.lower for s in m.outputs])
         if not np.any(np.isnan(known)):

@@ -231,7 +231,9 @@ def fit_prior(
         chosen = settled if after <= ENOUGH * before else chosen  # its updated weights may favour one output
     smoother = smoother_of(chosen)
     acting = shifted(train, fit.delay(chosen.theta))
-    answered = feedback([t.u for t in acting], smoother.prediction_errors(acting))
+    # a controller commands; acting inputs hold earlier commands, whose effects are in the errors if the delay is off
+    commanded = [t.u[-len(own.u) :] for t, own in zip(train, acting, strict=True)]
+    answered = feedback(commanded, smoother.prediction_errors(acting))
     if fit.free and (answered > 1.0 or fit.reach(chosen.theta) < length):
         on_progress(total - 1, total, PREDICTIONS)
         known = [replace(t, x=s.x) for t, s in zip(acting, smoother.smooth(acting), strict=True)]
@@ -245,13 +247,14 @@ def fit_prior(
             smoother = smoother_of(chosen)
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     warnings = warnings_of(fit, chosen, answered, min(scores) / max(scores[0], 1e-300))
+    lacking, late = 0.0, tuple[str, ...]()
     if fit.free and not largest_delay and first_states.kind not in ("known", "shared"):
-        warnings += late_inputs(fit, chosen.theta, guesses, periods, sizes, first_states)
+        lacking, late = late_inputs(fit, chosen.theta, guesses, periods, sizes, first_states)
     on_progress(total, total, "done")
     return PriorFit(
         values=fit.values(chosen.theta),
         standard_errors=standard_errors(fit, chosen),
-        warnings=warnings,
+        warnings=(*warnings, *late),
         stages=stages,
         correlations=correlations(fit, chosen),
         delay=fit.delay(chosen.theta),
@@ -261,6 +264,7 @@ def fit_prior(
         fading=smoother.fading,
         substeps=smoother.substeps,
         unidentified=chosen.unidentified,
+        lacking_delay=lacking,
     )
 
 

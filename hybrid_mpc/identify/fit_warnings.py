@@ -75,9 +75,9 @@ def late_inputs(
     periods: int,
     sizes: Array,
     first_states: FirstStates,
-) -> tuple[str, ...]:
-    """A warning if a delay of the inputs explains the first part, and every other part that is long enough, better than
-    the parameters alone; both are fitted to the same windows of the first part.
+) -> tuple[float, tuple[str, ...]]:
+    """The delay [s] and a warning if a delay of the inputs explains the first part, and every other part that is long
+    enough, better than the parameters alone; both are fitted to the same windows of the first part. Otherwise 0.
     """
     late, short = fit.with_delay(LATE * fit.dt), round(SHORT * LATE)
     for most in (periods, short) if periods > 2 * short else (periods,):
@@ -89,15 +89,16 @@ def late_inputs(
                 )
                 problems.append(Shooting(late, windows, sizes))
             elif not problems:
-                return ()
+                return 0.0, ()
         found = fitted_delay(fit, theta, problems)
         if found is not None and found.significant:
             ratios = " and ".join(f"{ratio:.2f}" for ratio in found.ratios)
-            return (
+            warning = (
                 f"{found}: such a delay would reduce the errors over {longest} periods of training and validation "
-                f"recordings by the factors {ratios}. {ADD_DELAY} [HM-IDENTIFY-080]",
+                f"recordings by the factors {ratios}. {ADD_DELAY} [HM-IDENTIFY-080]"
             )
-    return ()
+            return found.delay, (warning,)
+    return 0.0, ()
 
 
 @dataclass(frozen=True)

@@ -95,6 +95,7 @@ class PriorFit:
         substeps: Runge-Kutta sub-steps a period that the fitted prior needs within the range of the recordings.
             Default 0: as many as it needs at rest.
         unidentified: Parameters that are not identifiable one by one. Default: none.
+        lacking_delay: Delay of the inputs [s] that the recordings show and the prior lacks. Default: none.
     """
 
     values: dict[str, float]
@@ -109,6 +110,7 @@ class PriorFit:
     fading: float = 1.0
     substeps: int = 0
     unidentified: tuple[Combination, ...] = ()
+    lacking_delay: float = 0.0
 
     def smoother(self, prior: Prior, dt: float) -> Smoother:
         """The smoother around the fitted prior."""

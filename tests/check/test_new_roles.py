@@ -270,6 +270,19 @@ def test_what_no_input_reaches_and_what_acts():
     assert [name for name, verdict in found.items() if not verdict.sure] == ["c", "d"]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_supply_that_acts_beside_a_stronger_input_is_a_disturbance(seed):
+    """Its effect shows only if the input is known; the input seems to affect it by chance."""
+    rng, k = np.random.default_rng(seed), np.arange(3000)
+    duty = benchmark.steps_of(rng, len(k), 20)
+    supply = 0.05 * np.sin(0.05 * k) - 0.2 * (k % 900 > 500) + 0.005 * rng.standard_normal(len(k))
+    out = benchmark.lagged(10 * duty + 2 * supply, 1.0, 20, rng, 0.01)
+    found = judge_roles(
+        [Trait("duty", "-", (duty,)), Trait("v_out", "V", (out,)), Trait("v_in", "V", (12 + supply,))]
+    )
+    assert [verdict.kind for verdict in found.values()] == ["input", "output", "disturbance"]
+
+
 def test_a_rate_and_a_follower():
     t = 0.01 * np.arange(3000)
     x = np.sin(t) + 0.3 * np.sin(3.1 * t)

@@ -82,8 +82,8 @@ def good():
 def test_a_good_kit_promises_everything(good):
     assert verdicts(good[1]) == dict.fromkeys(
         (
-            "no offset", "set-points of the tasks", "step time", "horizon", "stability margins", "limits",
-            "process noise", "innovations", "disturbance model",
+            "no offset", "set-points of the tasks", "step time", "horizon", "stability margins", "late inputs",
+            "limits", "process noise", "innovations", "disturbance model",
         ),
         "shown",
     )  # fmt: skip
@@ -334,6 +334,23 @@ def test_a_loop_with_small_margins_is_a_doubt():
     assert (stuck.verdict, "lies on a bound" in stuck.evidence) == ("not promised", True)
 
 
+def test_inputs_that_act_as_late_as_the_recordings_show_are_a_doubt_if_the_loop_swings():
+    point = point_of(kit_of(tank()))
+    shown = p.late_inputs(point)
+    assert (shown.verdict, shown.remedy) == ("shown", "")
+    assert "level by 5 m" in shown.evidence
+    assert "1 period late" in shown.evidence
+    late = p.late_inputs(point, lacking_s=0.3)
+    assert (late.verdict, late.remedy) == ("doubted", p.LATE)
+    assert "3 periods late: level" in late.evidence
+    assert late.evidence.endswith("inputs act 0.3 s later than in the prior")
+    cautious = OCP(20, [0.0], [0.0], [100.0], [-1.0], [1.0], q_y=[10.0])
+    assert p.late_inputs(point_of(kit_of(tank(), cautious)), lacking_s=0.3).verdict == "shown"
+    # a loop that does not settle without a delay either is named by other rows
+    unstable = kit_of(tank(a=1.5), OCP(60, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0]))
+    assert p.late_inputs(point_of(unstable)) is None
+
+
 def test_a_hard_bound_that_no_plan_keeps_is_a_doubt():
     escapes = tank(a=1.5)
     problem = OCP(
@@ -348,6 +365,19 @@ def test_a_hard_bound_that_no_plan_keeps_is_a_doubt():
     assert p.limits([kept], [], {}).verdict == "shown"
     told = p.limits([kept], [], {"hold": {"level": 0.02}})
     assert (told.verdict, "2 % of the periods" in told.evidence) == ("doubted", True)
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0.03, "shown"), (0.2, "doubted")])
+@pytest.mark.parametrize("label", ["level [m]", "output level [m]"])
+def test_a_violation_of_a_soft_bound_beyond_the_noise_is_a_doubt(label, beyond, verdict):
+    problem = OCP(20, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0], x_max=[0.5], y_max=[0.5])
+    point = point_of(kit_of(tank(), problem))
+    excess = {"step": {label: 0.001, "valve [m/s]": 9.0}, "hold": {label: beyond}}
+    row = p.limits([point], [], {}, p.largest_violation(point, excess, "on the plant"))
+    name = label.removesuffix(" [m]")
+    assert f"{beyond} m of {name} in task hold on the plant (noise 0.01 m)" in row.evidence
+    assert (row.verdict, bool(row.remedy)) == (verdict, verdict == "doubted")
+    assert "no loop" in p.limits([point], [], {}, p.largest_violation(point, {})).evidence
 
 
 def test_a_loop_that_leaves_its_ranges_gives_one_row_and_a_horizon_that_holds_it():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybrid_mpc import Parameter, Prior, Signal, Trajectory
+from hybrid_mpc import Parameter, Prior, Signal, Trajectory, fit_prior
 from hybrid_mpc.identify.closed_loop import PredictionFit, feedback, fit_by_prediction
 from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.smooth import fit_smoother
@@ -48,6 +48,24 @@ def test_feedback_is_told_from_open_loop():
     """Twelve seeds each: a correlation of chance exceeds four standard deviations once in 16,000 times."""
     assert max(answered([record(seed, gain=0.0) for seed in (s, s + 100)]) for s in range(12)) < 1.0
     assert min(answered([record(seed, gain=2.0) for seed in (s, s + 100)]) for s in range(12)) > 1.5
+
+
+def test_a_fitted_delay_in_place_of_a_lag_is_no_feedback():
+    """The actuator has a lag of 60 ms, so what the delay leaves unexplained depends on the last commands."""
+    runs = []
+    for seed in range(3):
+        rng, x, v, y = np.random.default_rng(seed), 0.0, 0.0, np.empty(N)
+        u = np.repeat(rng.uniform(-1, 1, N // 4), 4)
+        for k in range(N):
+            y[k] = x + 0.002 * rng.standard_normal()
+            for _ in range(20):
+                v += (u[k] - v) * DT / 20 / 0.06
+                x += DT / 20 * (TRUTH["a"] * x + TRUTH["b"] * v)
+        z = np.zeros((N, 1))
+        runs.append(Trajectory(f"run{seed}", "train", DT, DT * np.arange(N), u[:, None], y[:, None], z, z))
+    found = fit_prior(First, runs[:2], runs[2:], dt=DT, largest_delay=2 * DT)
+    assert found.delay == pytest.approx(0.5 * DT, rel=0.1)
+    assert not any("closed loop" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize(

@@ -47,9 +47,14 @@ def promises_stage(context: Context) -> PromiseTable | Absent:
         if task is not None and row.arrays and (end := task_end(kit, task, row.arrays)) is not None:
             ends.setdefault(row.task, end)
     given_way = {row.task: row.given_way for row in rows if row.given_way}
+    excess: dict[str, dict[str, float]] = {}
+    for row in rows:
+        own = excess.setdefault(row.task, {})
+        own |= {label: max(value, own.get(label, 0.0)) for label, value in row.excess.items()}
     found = examine(
-        kit, tasks, ends=tuple(ends.values()), where=where, given_way=given_way,
+        kit, tasks, ends=tuple(ends.values()), where=where, given_way=given_way, excess=excess,
         tested=_tested(context, controller, kit.models[kit.recommended].n_y),
+        lacking_delay=context.prior.fit.lacking_delay,
         report=lambda done, total, text: context.progress.update("promises", done, total, text),
     )  # fmt: skip
     of_prior = structure(context.prior, context.read(CHOICE).choice, found_terms(context))
@@ -126,7 +131,7 @@ def _loops(context: Context, controller: str) -> tuple[list[LoopRow], str]:
         return [row for row in control.kept if row.controller == controller], "on the scenario's plant"
     if isinstance(on_model, Absent):
         return [], ""
-    rows = [row for row in on_model.drawn if row.controller == controller]
+    rows = [row for row in on_model.kept if row.controller == controller]
     return rows, f"on the model {on_model.plants.get(controller, '')}, not the machine"
 
 

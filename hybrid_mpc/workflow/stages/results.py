@@ -24,7 +24,7 @@ from hybrid_mpc.workflow.stages.promises import PROMISES
 from hybrid_mpc.workflow.stages.track import TRACK, TrackResult
 from hybrid_mpc.workflow.stages.watch import WATCH, WatchResult
 
-SCHEMA_VERSION = 13
+SCHEMA_VERSION = 14
 SHOWN: tuple[Stage[Any], ...] = (
     DATA, EXPLAIN, PRIOR, TRAINING, CHOICE, EVALUATION, EXPORT, TRACK, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION,
     PROMISES, WATCH, ANALYSIS,
