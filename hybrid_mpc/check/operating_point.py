@@ -91,7 +91,8 @@ def place_of(prior: Prior) -> str:
     base = getattr(type(prior), "base", type(prior))
     if len(base.states) == len(prior.states):
         return "operating_point"
-    return f"the class that extended({base.__name__}, ...) returns: NAME.operating_point = OperatingPoint(x=(...), u=(...))"
+    own = f"the class that extended({base.__name__}, ...) returns"
+    return f"{own}: NAME.operating_point = OperatingPoint(x=(...), u=(...))"
 
 
 def _why_not_held(prior: Prior) -> str:

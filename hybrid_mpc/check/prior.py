@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hybrid_mpc.errors import InputError, named_extra, no_exit, said_by
 from hybrid_mpc.identify.simulation import rest_of
 from hybrid_mpc.machine.mechanical import MechanicalPrior
-from hybrid_mpc.machine.prior import POINT, BalanceEquations, OperatingPoint, Prior, column
+from hybrid_mpc.machine.prior import POINT, BalanceEquations, Prior, column
 from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.machine.units import differ, is_product, per_second
 from nn_export import ExportError

@@ -26,7 +26,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.names import DRIVING_UNITS, REACHED_UNITS, Role, is_command_of, is_set_point_of, role_said_by
+from hybrid_mpc.data.names import (
+    DRIVING_UNITS,
+    REACHED_UNITS,
+    Role,
+    is_command_of,
+    is_set_point_of,
+    role_said_by,
+)
 from hybrid_mpc.machine.units import turn_in
 
 Array = NDArray[np.float64]

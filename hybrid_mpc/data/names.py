@@ -338,5 +338,7 @@ def is_set_point_of(goal: str, other: str) -> bool:
         >>> is_set_point_of("xset_mm", "x_mm"), is_set_point_of("offset", "x_mm")
         (True, False)
     """
-    one, two = ("".join(_plain(word) for word in _parted(name_and_unit(name)[0])[0]) for name in (goal, other))
+    one, two = (
+        "".join(_plain(word) for word in _parted(name_and_unit(name)[0])[0]) for name in (goal, other)
+    )
     return one != two and one.startswith(two) and one[len(two) :] in SET_POINT

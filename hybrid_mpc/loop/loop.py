@@ -249,8 +249,8 @@ class Loop:
         """Start while the machine is at rest: first estimate, first plan (which may take longer), first input.
 
         The arguments are those of :meth:`step`; ``applied`` is the input applied until now, by default that of the
-        operating point. Returns the input ``(n_u,)`` to hold from now on. InputError also for a ``reference`` outside the
-        declared range of its signal.
+        operating point. Returns the input ``(n_u,)`` to hold from now on. Raises InputError also for a ``reference``
+        outside the declared range of its signal.
         """
         if in_time is not None:
             check_function(in_time, "in_time")

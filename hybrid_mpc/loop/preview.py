@@ -143,7 +143,9 @@ def beyond_range(reference: Array, problem: Problem) -> str:
     for weight, s, column in zip(weights, signals, reference.T, strict=False):  # further columns: parameters
         wrong = column[(column < s.lower) | (column > s.upper)]
         if weight > 0 and wrong.size and not s.periodic:
-            return f"{s.name} = {wrong[0]:g} {s.unit} is outside its range {s.lower:g} to {s.upper:g} {s.unit}"
+            return (
+                f"{s.name} = {wrong[0]:g} {s.unit} is outside its range {s.lower:g} to {s.upper:g} {s.unit}"
+            )
     return ""
 
 

@@ -182,10 +182,13 @@ class Prior:
         for key in "xuw" if point else "":
             names, given = self.names_of(key), getattr(point, key)
             if len(given) != len(names):
+                of_terms = (
+                    ". The states of terms belong to the class that extended(...) returns: set its operating_point "
+                    "after that line" if key == "x" and len(given) > len(names) else ""
+                )  # fmt: skip
                 raise InputError(
-                    f"{kind}: operating_point: {key} must have {len(names)} numbers ({', '.join(names) or 'none'}), got "
-                    f"{len(given)}: {given}. States of terms belong to the class that extended(...) returns: set its "
-                    "operating_point after that line [HM-MACHINE-049]"
+                    f"{kind}: operating_point: {key} must have {len(names)} numbers "
+                    f"({', '.join(names) or 'none'}), got {len(given)}: {given}{of_terms} [HM-MACHINE-049]"
                 )
 
     @property

@@ -88,5 +88,7 @@ def test_a_point_with_the_states_of_terms_belongs_to_the_extended_class():
     assert place_of(Tank()) == "operating_point"
     assert "extended(Tank, ...)" in place_of(kind())
     kind.operating_point = OperatingPoint((1.0,), (0.5,))
-    with pytest.raises(InputError, match=r"TankExtended.*x must have 2 numbers \(level, acting\).*HM-MACHINE-049"):
+    with pytest.raises(
+        InputError, match=r"TankExtended.*x must have 2 numbers \(level, acting\).*HM-MACHINE-049"
+    ):
         kind()

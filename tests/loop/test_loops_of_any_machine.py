@@ -100,7 +100,9 @@ def test_a_set_point_outside_the_range_of_its_signal_is_refused_at_the_start_and
     assert loop.beyond == ""
     loop.step([0.2], reference=[[20.0]])
     assert "lower = 20 m" in loop.beyond
-    result = closed(model, TANKS, parts[0], MachinePlant(model), lambda t: np.where(t < 50, 0.3, 20.0)[:, None], 100.0)
+    result = closed(
+        model, TANKS, parts[0], MachinePlant(model), lambda t: np.where(t < 50, 0.3, 20.0)[:, None], 100.0
+    )
     np.testing.assert_array_equal(result.reached, result.t < 50)
     motor = dc_motor()
     Loop(observer(motor, None), CondensedController(motor, MOTOR), reference=[1e9, 1.0])

@@ -162,7 +162,11 @@ def test_a_stopped_command_goes_on_after_its_last_step(machine, files, tmp_path,
 
 
 def test_a_search_goes_on_or_ends_with_another_number_of_steps(machine, files, tmp_path, monkeypatch):
-    settings, out, whole = RunSettings(str(machine / "my_machine.py"), files), tmp_path / "out", explain_search.search
+    settings, out, whole = (
+        RunSettings(str(machine / "my_machine.py"), files),
+        tmp_path / "out",
+        explain_search.search,
+    )
 
     def stopped(*given, on_step, **more):
         def kept(told):
