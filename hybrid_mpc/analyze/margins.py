@@ -42,6 +42,9 @@ DIFFERENCE = 1e-4
 error of the solves (1e-9) is divided by the step."""
 MOST_DELAY = 200
 """Maximum number of whole periods of delay that are tried."""
+LEAST_GAIN = 1e-3
+"""Factors on a loop's gain below which a margin counts as 0: rounding turns an integrator's infinite gain at frequency
+zero into a large negative one."""
 
 
 @dataclass(frozen=True)
@@ -351,7 +354,7 @@ class Margins:
 
     Args:
         gain_up: Smallest factor above 1 on the loop's gain that makes the loop unstable; infinite if there is none.
-        gain_down: Largest such factor below 1; 0 if there is none.
+        gain_down: Largest such factor below 1; 0 if there is none above 0.001.
         phase: Smallest phase margin [rad]; infinite without gain crossover.
         delay: Smallest delay margin [s]: smallest ratio of phase margin to frequency over all gain crossovers.
         delay_periods: Largest number of whole periods of delay at the input for which the closed loop is stable.
@@ -442,7 +445,7 @@ class LinearLoop:
         size = min(float(disk), 2.0)
         return Margins(
             gain_up=float(min((k for k in gains if k > 1), default=np.inf)),
-            gain_down=float(max((k for k in gains if k < 1), default=0.0)),
+            gain_down=float(max((k for k in gains if LEAST_GAIN <= k < 1), default=0.0)),
             phase=float(np.abs(phases).min(initial=np.inf)),
             delay=float(min(delays, default=np.inf)),
             delay_periods=self._delay_periods(input),

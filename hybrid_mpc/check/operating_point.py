@@ -86,6 +86,15 @@ def both_ways(prior: Prior) -> str:
     return f"Steady states under your input: {states}. Input that holds your states: {inputs}"
 
 
+def place_of(prior: Prior) -> str:
+    """Where an operating point with all states belongs: in the class, or after ``extended`` if terms have states."""
+    base = getattr(type(prior), "base", type(prior))
+    if len(base.states) == len(prior.states):
+        return "operating_point"
+    own = f"the class that extended({base.__name__}, ...) returns"
+    return f"{own}: NAME.operating_point = OperatingPoint(x=(...), u=(...))"
+
+
 def _why_not_held(prior: Prior) -> str:
     """Why no input holds the operating point's states, and an equilibrium with one of its outputs, if there is one."""
     text = "none within its range" if _found(prior, _places_of_inputs(prior)).steady else (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.analyze.equilibria import Equilibrium, equilibria
 from hybrid_mpc.check.default_tasks import default_tasks
-from hybrid_mpc.check.operating_point import both_ways, drift_at_rest, sizes_of
+from hybrid_mpc.check.operating_point import both_ways, drift_at_rest, place_of, sizes_of
 from hybrid_mpc.check.prior import Report, check_prior
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes
@@ -207,7 +207,7 @@ def _check_equilibrium(report: Report, prior: Prior, second: float) -> None:
         x, u, _ = rest_of(prior)
         report.add(
             f"prior: operating_point is not an equilibrium: at x = {x.tolist()}, u = {u.tolist()} {moving}. "
-            f"{both_ways(prior)}. Write one of these pairs into operating_point [HM-CHECK-015]"
+            f"{both_ways(prior)}. Write one of these pairs into {place_of(prior)} [HM-CHECK-015]"
         )
 
 
@@ -218,7 +218,7 @@ def warn_of_drift(prior: Prior, second: float) -> tuple[str, ...]:
         return ()
     return (
         f"operating_point is not an equilibrium with the fitted parameters ({moving}), but observers start there. "
-        "Write the fitted values into the prior's parameters, and their steady state into operating_point. "
+        f"Write the fitted values into the prior's parameters, and their steady state into {place_of(prior)}. "
         f"{both_ways(prior)}",
     )
 

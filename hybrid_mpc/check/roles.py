@@ -26,7 +26,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.names import DRIVING_UNITS, REACHED_UNITS, Role, is_command_of, role_said_by
+from hybrid_mpc.data.names import (
+    DRIVING_UNITS,
+    REACHED_UNITS,
+    Role,
+    is_command_of,
+    is_set_point_of,
+    role_said_by,
+)
 from hybrid_mpc.machine.units import turn_in
 
 Array = NDArray[np.float64]
@@ -406,11 +413,14 @@ class _Judge:
             "label": "an error, a fault, a correction or a part of a command by its name",
         }
         for trait in self.open:
-            if trait.said in kinds:
-                reason, sure = reasons.get(trait.said, BY_NAME), trait.said != "disturbance"
-                if trait.said == "set-point" and not self._is_followed(trait):
+            said = trait.said or (
+                "set-point" if any(is_set_point_of(trait.full, name) for name in self.traits) else ""
+            )
+            if said in kinds:
+                reason, sure = reasons.get(said, BY_NAME), said != "disturbance"
+                if said == "set-point" and not self._is_followed(trait):
                     reason, sure = f"{BY_NAME}, but no column follows this set-point: may be an input", False
-                self._say(trait, kinds[trait.said], reason, sure)
+                self._say(trait, kinds[said], reason, sure)
         # a drive's measurement of its command, or the second of two commands in series
         inputs = [t for t in self.of("input") if t.full not in self.given]
         for one in [t for t in inputs if t.said == "actuator"]:
@@ -449,9 +459,10 @@ class _Judge:
             link = self.links.of(goal, best)
             if link < ACTS or self.links.into(goal, others) * LEADS > link:
                 continue
+            inputs = self.of("input")  # also of an integrator, whose rate is its input
             drives = [
-                t for t in [*self.open, *self.of("input")]
-                if t is not goal and t is not best and not is_rate(t, best) and not is_rate(best, t)
+                t for t in [*self.open, *inputs]
+                if t is not goal and t is not best and (t in inputs or not (is_rate(t, best) or is_rate(best, t)))
                 and self.links.of(goal, t, now=True) >= ACTS and self.links.of(t, best) * LEADS >= link
             ]  # fmt: skip
             if not drives:
@@ -459,7 +470,7 @@ class _Judge:
             self._say(goal, "set-point", f"{best.full!r} follows this column", False)
             if best.full not in self.found:
                 self._say(best, "output", f"follows {goal.full!r}", False)
-            drive = max(drives, key=lambda t: t.roughness)
+            drive = max(drives, key=lambda t: (t in inputs, t.roughness))
             if drive.full not in self.found and drive.said == "":
                 self._say(drive, "input", f"responds to {goal.full!r} and affects {best.full!r}", False)
 

@@ -43,7 +43,7 @@ def explain(
     """Find physical terms that the prior lacks: fit it, search a library of terms, evaluate on held-out recordings.
 
     Writes explain.html, explain.json and NAME_explained.py, a scenario whose prior has the found terms. No network is
-    trained. Repeat the command to continue a search that was stopped.
+    trained. Repeat the command to continue a search that was stopped, also with another --most.
     """
     from hybrid_mpc.cli.progress import make_progress, print_summary
     from hybrid_mpc.workflow.explain import explain as search

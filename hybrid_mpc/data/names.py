@@ -329,3 +329,16 @@ def is_command_of(command: str, other: str) -> bool:
     """
     one, two = ([_plain(word) for word in _parted(name_and_unit(name)[0])[0]] for name in (command, other))
     return one != two and [word for word in one if word not in COMMAND] == two
+
+
+def is_set_point_of(goal: str, other: str) -> bool:
+    """Whether a name is another one and a word for a set-point, written as one word: ``xset_mm`` and ``x_mm``.
+
+    Example:
+        >>> is_set_point_of("xset_mm", "x_mm"), is_set_point_of("offset", "x_mm")
+        (True, False)
+    """
+    one, two = (
+        "".join(_plain(word) for word in _parted(name_and_unit(name)[0])[0]) for name in (goal, other)
+    )
+    return one != two and one.startswith(two) and one[len(two) :] in SET_POINT

@@ -29,6 +29,7 @@ from hybrid_mpc.identify.starts import POOR
 from hybrid_mpc.identify.windows import OutputWindows
 from hybrid_mpc.machine.prior import POINT, Parameter, Prior, components
 from hybrid_mpc.machine.units import turn_in
+from hybrid_mpc.rules import counted
 
 Array = NDArray[np.float64]
 LARGEST = 1e7
@@ -373,8 +374,11 @@ class _FactorFit(_Lenient):
     A negative number stands for no term.
     """
 
-    def __init__(self, make: Callable[..., Prior], dt: float) -> None:
+    def __init__(
+        self, make: Callable[..., Prior], dt: float, on_progress: Callable[[str], None] = lambda text: None
+    ) -> None:
         super().__init__(with_factor(make), dt)
+        self.on_progress = on_progress
         self.term_names = terms_of(make())
         self.chosen: Sequence[int] = ()
         self.held = False
@@ -460,6 +464,7 @@ def causes(
     dt: float,
     longest: float,
     time_unit: float,
+    on_progress: Callable[[str], None] = lambda text: None,
 ) -> tuple[Cause, ...]:
     """Search mistakes in a prior that explain its errors on recordings; the likeliest first, then equally likely ones.
 
@@ -477,9 +482,10 @@ def causes(
         dt: Model period [s].
         longest: Length [s] of the free runs that evaluate models; shorter ones are used if small errors grow.
         time_unit: The machine's time unit [s].
+        on_progress: Called before every group of trial fits with a text. Default: nothing.
     """
     known, sizes, noise = _smoothed(make, recorded, dt, time_unit)
-    fit = _FactorFit(make, dt).visiting(known)
+    fit = _FactorFit(make, dt, on_progress).visiting(known)
     thetas = [fit.nominal, fit.scaled({**fit.prior.values, **values})]
     lengths = _lengths(fit, thetas, longest)
 
@@ -499,7 +505,7 @@ def causes(
         before, found = _explained(fit, problem, short, plain, moved)
         if before * min((one.ratio for one in found), default=1.0) > POOR or not found:
             signals = _signals(
-                make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit
+                make, recorded, before, [theta[:-1] for theta in thetas], dt, length, time_unit, on_progress
             )
             found += [one for one in signals if one.ratio <= NAMED]
         if length > lengths[0]:  # on an unstable machine, a wrong model may only diverge later
@@ -659,6 +665,8 @@ def _tried(
         groups.setdefault(substeps.bit_length(), []).append(i)
     found = []
     for own in groups.values():
+        length = fit.dt * (problem.windows.y.shape[1] - 1)
+        fit.on_progress(f"{counted(len(own), 'trial fit')} in free runs of {length:.3g} s")
         chosen, thetas = (
             fit.choosing([begun[i].term for i in own], held),
             np.stack([begun[i].theta for i in own]),
@@ -750,7 +758,7 @@ def _smoothed(
 
 def _signals(
     make: Callable[..., Prior], recorded: Sequence[Trajectory], before: float, starts: Sequence[Array], dt: float,
-    length: float, time_unit: float,
+    length: float, time_unit: float, on_progress: Callable[[str], None],
 ) -> Iterator[Cause]:  # fmt: skip
     """Causes in the signals: wrong sign, exchanged signals, angles with another zero."""
     prior = make()
@@ -776,6 +784,7 @@ def _signals(
                 for i, other in enumerate(signals[:j])
             ]
     for what, why, change in changes:
+        on_progress(f"{what}: {why}")
         known, sizes, _ = _smoothed(make, [change(t) for t in recorded], dt, time_unit)
         fit = _Lenient(make, dt)
         fit.points = visited(known)

@@ -31,7 +31,17 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.delay import filtered, sees_truth, whole_periods
 from hybrid_mpc.estimate.kalman import Estimate, Estimator
 from hybrid_mpc.loop.guard import Guard, GuardedController, GuardState, Switch
-from hybrid_mpc.loop.preview import Forecast, Preview, Previews, held, n_tracked, shortest_way, with_unknown
+from hybrid_mpc.loop.preview import (
+    Forecast,
+    Preview,
+    Previews,
+    beyond_range,
+    held,
+    n_tracked,
+    refuse_beyond,
+    shortest_way,
+    with_unknown,
+)
 from hybrid_mpc.machine.signals import nearest_turn as moved_by_turns
 from hybrid_mpc.model.limits import check_function, check_part, floats, sampled, whole
 from hybrid_mpc.model.model import HybridModel
@@ -121,7 +131,7 @@ class Loop:
             u = loop.step(read())
 
     ``finish`` may be omitted; the next step then calls it, with the same inputs. No sensor, model or reference value
-    can raise an exception, and an input is always within the limits.
+    can raise an exception after the start, and an input is always within the limits.
 
     Args:
         estimator: Filter, or :class:`~hybrid_mpc.estimate.kalman.TrueState`, which needs the truth in each step.
@@ -144,7 +154,8 @@ class Loop:
         now: Clock [s] of the durations. Default: the computer's clock.
 
     Raises:
-        InputError: If sizes, periods or delays do not match, or a guard has no monitor.
+        InputError: If sizes, periods or delays do not match, a guard has no monitor, or a set-point is outside the
+            declared range of its signal.
 
     Example:
         >>> import casadi as ca
@@ -238,12 +249,15 @@ class Loop:
         """Start while the machine is at rest: first estimate, first plan (which may take longer), first input.
 
         The arguments are those of :meth:`step`; ``applied`` is the input applied until now, by default that of the
-        operating point. Returns the input ``(n_u,)`` to hold from now on.
+        operating point. Returns the input ``(n_u,)`` to hold from now on. Raises InputError also for a ``reference``
+        outside the declared range of its signal.
         """
         if in_time is not None:
             check_function(in_time, "in_time")
         sample, measured = self._sample(y), self._check_disturbances(w)
         x_ref, factors = self._read_preview(0, reference)
+        if reference is not None:
+            refuse_beyond(x_ref, self.problem)
         estimate = self._estimator.start(
             self._choose_measurement(sample, truth), 0.0, **self._select_measured(measured)
         )
@@ -458,6 +472,14 @@ class Loop:
     def standing(self) -> Array:
         """The operating point as reference ``(columns,)``: the default reference."""
         return self.problem.standing()[0]
+
+    @property
+    def beyond(self) -> str:
+        """The first set-point of this period's preview outside its signal's declared range, as text; else empty.
+
+        The loop follows such a set-point as far as the limits allow.
+        """
+        return beyond_range(self.previewed[0], self.problem)
 
     @property
     def safe_input(self) -> Array | None:

@@ -129,4 +129,29 @@ def _function_of(reference: Preview | ArrayLike | None, problem: Problem) -> Pre
     goal = problem.standing()[0]
     if reference is not None:
         goal = sampled(reference, goal.shape, problem.reference_name)
+        refuse_beyond(goal[None], problem)
     return lambda t: np.tile(goal, (len(t), 1))
+
+
+def beyond_range(reference: Array, problem: Problem) -> str:
+    """The first set-point in the rows ``(m, columns)`` outside its signal's declared range, as text; empty without one.
+
+    Signals without weight, and periodic ones, whose references count turns, are not checked.
+    """
+    ocp, model = problem.ocp, problem.model
+    weights, signals = (ocp.q_y, model.outputs) if ocp.n_y else (ocp.q, model.states)
+    for weight, s, column in zip(weights, signals, reference.T, strict=False):  # further columns: parameters
+        wrong = column[(column < s.lower) | (column > s.upper)]
+        if weight > 0 and wrong.size and not s.periodic:
+            return (
+                f"{s.name} = {wrong[0]:g} {s.unit} is outside its range {s.lower:g} to {s.upper:g} {s.unit}"
+            )
+    return ""
+
+
+def refuse_beyond(reference: Array, problem: Problem) -> None:
+    """Refuse set-points outside the declared ranges of their signals."""
+    if text := beyond_range(reference, problem):
+        raise InputError(
+            f"reference: {text}. Correct the value or its unit, or the bounds of the signal [HM-LOOP-054]"
+        )

@@ -22,7 +22,7 @@ from hybrid_mpc.loop.faults import Fault, check_channels, install
 from hybrid_mpc.loop.guard import Guard, Switch
 from hybrid_mpc.loop.loop import TIMED, Loop, Monitor, Reading
 from hybrid_mpc.loop.plant import Plant, SimulatedMachine
-from hybrid_mpc.loop.preview import Preview, Previews, n_tracked, shortest_way
+from hybrid_mpc.loop.preview import Preview, Previews, beyond_range, n_tracked, shortest_way
 from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.limits import check_function, check_part, sampled, vector, whole
 from hybrid_mpc.model.model import HybridModel
@@ -116,7 +116,7 @@ def simulate(
         The record of ``round(duration / dt)`` periods.
 
     Raises:
-        InputError: If a period, shape or channel is wrong.
+        InputError: If a period, shape or channel is wrong, or a set-point is outside the declared range of its signal.
 
     Example: see ``tests/loop``; with a scenario::
 
@@ -181,6 +181,8 @@ def simulate(
             error = shown - goal.y if cost.n_y else None
             stage = float(cost.stage_cost(x, u, goal.x, u - u_prev, weights, u_ref=goal.u, y_error=error))
         step = Step(k, t, x, y, loop.estimate, loop.decision, loop.reading)
+        if beyond_range(reference_now[:1], loop.problem):
+            goal = goal._replace(reached=False)
         rows.append(_record(step, goal, known_w, stage, loop.spent))
         if on_step is not None:
             on_step(step)
@@ -324,7 +326,8 @@ class ClosedLoopResult:
             columns. Default: none.
         y_ref: Reference of the outputs ``(n, n_y)`` at ``t_k``; NaN if the reference is one of states. Default:
             unknown.
-        reached: ``(n,)``, False if the set-point cannot be reached. Default: unknown.
+        reached: ``(n,)``, False if the set-point cannot be reached, or is outside the declared range of its signal.
+            Default: unknown.
         given_way: For each period the relaxed hard bounds, because no plan keeps all of them: largest violation in the
             plan by name, as in :class:`~hybrid_mpc.control.problem.Solution`. Default: unknown.
 

@@ -107,7 +107,8 @@ class Prior:
         values: Parameter values [their units] by name that replace nominal ones, e.g. fitted values.
 
     Raises:
-        InputError: If a name in ``values`` is no parameter or a role has no signals; and, when the class is defined, if
+        InputError: If a name in ``values`` is no parameter, a role has no signals, or the operating point does not have
+            one number for each of them; and, when the class is defined, if
             a signal or parameter is of another type.
 
     Example:
@@ -163,12 +164,32 @@ class Prior:
                 f"{kind} has no {' and no '.join(missing)}. Write {missing[0]} = (Signal(name, unit), ...) in the "
                 "class. [HM-MACHINE-008]"
             )
+        self._check_point(kind)
         self._values = {p.name: float(given.pop(p.name, p.value)) for p in self.parameters}
         if given:
             raise InputError(
                 f"{kind} has no parameter {', '.join(given)}; it has {', '.join(self._values) or 'none'}"
                 " [HM-MACHINE-009]"
             )
+
+    def _check_point(self, kind: str) -> None:
+        """Check that the operating point has one number for each signal."""
+        point: Any = self.operating_point
+        if not isinstance(point, OperatingPoint | None):
+            raise InputError(
+                f"{kind}: operating_point must be OperatingPoint(x=(...), u=(...)), got {point!r:.80} [HM-MACHINE-048]"
+            )
+        for key in "xuw" if point else "":
+            names, given = self.names_of(key), getattr(point, key)
+            if len(given) != len(names):
+                of_terms = (
+                    ". The states of terms belong to the class that extended(...) returns: set its operating_point "
+                    "after that line" if key == "x" and len(given) > len(names) else ""
+                )  # fmt: skip
+                raise InputError(
+                    f"{kind}: operating_point: {key} must have {len(names)} numbers "
+                    f"({', '.join(names) or 'none'}), got {len(given)}: {given}{of_terms} [HM-MACHINE-049]"
+                )
 
     @property
     def values(self) -> dict[str, float]:

@@ -21,6 +21,9 @@ from hybrid_mpc.workflow.stages.identify import (
     examined_prior,
 )
 
+MANY = 500
+"""Periods of the longest windows above which the fit may take minutes."""
+
 
 @no_exit()
 @named_extra("the fit")
@@ -64,12 +67,21 @@ def fit_of(context: Context) -> PriorResult:
     return _fitted(context)
 
 
+def long_windows(context: Context) -> str:
+    """Text about windows of more than ``MANY`` periods that ``free_run`` can shorten; empty if there are none."""
+    length, dt = context.fit_length, context.spec.dt
+    if context.spec.free_run or length is None or length <= MANY * dt:
+        return ""
+    own = f"windows up to {length:.3g} s, {length / dt:.0f} periods, which takes long"
+    return f" ({own}; DataSpec.free_run limits them)"
+
+
 def _fitted(context: Context) -> PriorResult:
     progress = context.progress
     progress.start(DATA.title)
     data_stage(context)
     progress.finish("")
-    progress.start(PRIOR.title)
+    progress.start(PRIOR.title + long_windows(context))
     found = examined_prior(context)
     progress.finish("")
     return found

@@ -42,8 +42,8 @@ def explain(
     """Fit the prior, search for missing physical terms, and write the result into ``out``.
 
     ``explain.json`` holds the result, ``explain.html`` shows it, ``NAME_explained.py`` is a scenario whose prior has
-    the found terms, with the fitted values as nominal values. The same arguments continue an interrupted search.
-    Nothing is trained.
+    the found terms, with the fitted values as nominal values. The same arguments continue an interrupted search;
+    ``most`` may differ. Nothing is trained.
 
     Args:
         settings: Scenario, recordings and columns, as for a run.
@@ -72,7 +72,7 @@ def explain(
     make = prior_class(scenario)
     # bad recordings leave no folder behind
     data = _recordings(context, make) if settings.data else None
-    note = JobNote("search", {**settings.identity(), "terms": tuple(terms), "most": most})
+    note = JobNote("search", {**settings.identity(), "terms": tuple(terms)}, {"most": most})
     with open_folder(out, note, resume=None):
         if data is None:
             data = _simulated(context, make)

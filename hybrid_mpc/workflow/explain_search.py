@@ -195,9 +195,12 @@ class Search:
         """Result of the search by free runs of ``length`` [s]; an interrupted one continues after its last step."""
         known_ = smoothed(self.make, fit, [*self.train, *self.valid], self.dt)
         candidates = self.chosen.candidates(self.make(fit.values), visited(known_), self.dt, length)
-        done = self._held("search")
-        if done is not None:
-            return record(Explanation, done, "the search")
+        ended = self._held("ended")
+        if ended is not None:
+            done = record(Explanation, ended["found"], "the search")
+            # with fewer terms than allowed it ended for another reason
+            if _added(done) < ended["most"] or _added(done) >= self.most:
+                return done
         held = self._held("steps")
         begun = None if held is None else record(Explanation, held, "the steps of the search")
         progress, count = self.context.progress, len(candidates) + len(self.chosen.own)
@@ -219,7 +222,7 @@ class Search:
             on_progress=self._progress("candidates"), on_step=keep,
         )  # fmt: skip
         progress.finish(found.reason)
-        self._keep("search", found)
+        self._keep("ended", {"found": found, "most": self.most})
         return found
 
     def tests(self, fit: PriorFit, explanation: Explanation, length: float | None) -> dict[str, FreeRuns]:

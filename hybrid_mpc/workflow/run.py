@@ -40,11 +40,9 @@ NAMES = tuple(stage.name for stage in STAGES)
 ALWAYS = (TASKS.name, REPORT.name)
 """Stages that run even if ``only`` does not name them: they only write what scenario and other stages hold."""
 SECONDS = {
-    "data": 2, "explain": 20, "prior": 4, "training": 20, "choice": 4, "evaluation": 3, "export": 7, "track": 30,
-    "noise": 4,
-    "tasks": 1, "control": 42,
-    "on_model": 14, "estimation": 1, "promises": 6, "watch": 36, "analysis": 1,
-    "report": 9,
+    "data": 4, "explain": 20, "prior": 22, "training": 26, "choice": 5, "evaluation": 4, "export": 7, "track": 30,
+    "noise": 5, "tasks": 1, "control": 26, "on_model": 14, "estimation": 1, "promises": 7, "watch": 33, "analysis": 1,
+    "report": 12,
 }  # fmt: skip
 """Duration of each stage of `make demo` on two idle cores [s]; ``on_model`` only runs without a plant. The remaining
 time of a run is estimated by these durations, scaled with the measured durations of its finished stages."""
@@ -141,7 +139,7 @@ def remaining(took: Mapping[str, float], ahead: Sequence[str]) -> str:
         ahead: Names of the remaining stages.
 
     Example:
-        >>> remaining({"data": 4.0, "prior": 8.0, "training": 40.0}, ["watch", "analysis", "report"])
+        >>> remaining({"data": 8.0, "prior": 44.0, "training": 52.0}, ["watch", "analysis", "report"])
         ' (about 2 min left)'
         >>> remaining({"data": 4.0}, ["prior"])
         ''

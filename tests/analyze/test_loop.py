@@ -24,6 +24,7 @@ from hybrid_mpc import (
     steady_filter,
     system_structure,
 )
+from hybrid_mpc.analyze.margins import LEAST_GAIN, LinearLoop
 from hybrid_mpc.analyze.properties import hankel_singular_values
 
 
@@ -237,6 +238,16 @@ def test_sensitivity_functions_fit_each_other_and_the_closed_loop():
     assert np.allclose(g[1, 1], found["KS"][0, 0], rtol=1e-8)  # from noise to the input
     assert np.allclose(g[1, 0], -found["T"][0, 0], rtol=1e-8)
     assert abs(found["S"][0, 0, 0]) < 0.5  # the disturbance is followed
+
+
+@pytest.mark.parametrize("growth", [1e-13, 1e-4, 1e-2])
+def test_a_gain_margin_that_only_rounding_shows_is_zero(growth):
+    """An integrator whose pole is moved by ``growth``, with the gain 0.5: stable for factors above ``2 growth``."""
+    plant = control.ss(1 + growth, 1.0, 1.0, 0.0, 0.02)
+    feedback = control.ss(0.0, 0.0, 0.0, -0.5, 0.02, remove_useless_states=False)
+    loop = LinearLoop(plant, feedback, plant, np.array([0.5 + growth]))
+    down = 2 * growth if 2 * growth > LEAST_GAIN else 0.0
+    assert loop.margins().gain_down == pytest.approx(down, rel=1e-3, abs=0.0)
 
 
 def test_an_unstable_loop_has_no_margins():

@@ -454,3 +454,37 @@ def test_a_second_flow_that_nothing_affects_is_an_input_too():
     units = {"feed_lpm": "l/min", "coolant_lpm": "l/min"}
     found = judge_roles([Trait(name, units.get(name, ""), (c,)) for name, c in noisy.items()])
     assert [verdict.kind for verdict in found.values()] == ["input", "input", "output", "output"]
+
+
+def servo_cylinder(seed=0, m=4000, dt=0.005):
+    """A cylinder that integrates its valve's flow, in closed loop: valve, position, pressure, set-point."""
+    rng = np.random.default_rng(seed)
+    x, v, p, goal, wanted, rows = 0.0, 0.0, 0.0, 0.0, 0.0, []
+    for k in range(m):
+        wanted = rng.uniform(0, 1) if k % 200 == 0 else wanted
+        goal = goal + 0.02 * (wanted - goal) if k else wanted
+        u = 30 * (goal - x)
+        rows.append((u, x, p, goal))
+        h = dt / 40
+        for _ in range(40):
+            p += h * 500 * (u - 10 * v)
+            v += h * 20 * (p - 2 * np.tanh(v / 0.02))
+            x += h * v
+    table = np.array(rows)
+    table[:, :3] += rng.normal(0, 1, (m, 3)) * table[:, :3].std(axis=0) * [0.003, 0.001, 0.005]
+    return dict(zip(("u_V", "xp_mm", "pA_bar", "xset_mm"), table.T, strict=True))
+
+
+def test_the_set_point_of_an_integrator_whose_rate_is_its_input():
+    right = {"u_V": "input", "xp_mm": "output", "pA_bar": "output", "xset_mm": "set-point"}
+    table, units = servo_cylinder(), {"u_V": "V", "xp_mm": "mm", "pA_bar": "bar", "xset_mm": "mm"}
+    assert kinds(table, units) == right
+    given = {name: kind for name, kind in right.items() if kind != "set-point"}
+    assert kinds(table, units, given) == right
+
+
+def test_a_set_point_named_in_one_word_with_its_output():
+    u, slow = steps(), np.cumsum(0.1 * np.random.default_rng(3).standard_normal(1500))
+    table = {"u": u, "xset_mm": slow, "x_mm": lag(u)}
+    assert kinds(table)["xset_mm"] == "set-point"
+    assert kinds({"u": u, "offset": slow, "x": lag(u)})["offset"] != "set-point"

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from hybrid_mpc import OperatingPoint, Parameter, Prior, Signal, extended, terms, with_nominal
+from hybrid_mpc import InputError, OperatingPoint, Parameter, Prior, Signal, extended, terms, with_nominal
 from hybrid_mpc.check.operating_point import (
     both_ways,
     drift_at_rest,
     held_states,
     holding_input,
+    place_of,
     steady_point,
 )
 
@@ -74,3 +75,20 @@ def test_states_of_terms_follow_the_input_that_holds_the_machine():
     moved = with_nominal(kind, {"k": 0.5}, point)
     assert moved.operating_point == with_nominal(moved, {}).operating_point == point
     assert drift_at_rest(moved(), 1e3) == ""
+
+
+def test_a_point_with_the_states_of_terms_belongs_to_the_extended_class():
+    class Longer(Tank):
+        operating_point = OperatingPoint((1.0, 0.5), (0.5,))
+
+    lag = terms.input_lag("inflow", Parameter("tau", 2.0, "s", 0.1, 9.0), state=Signal("acting", "m/s"))
+    with pytest.raises(InputError, match=r"Longer.*x must have 1.*got 2.*HM-MACHINE-049"):
+        extended(Longer, lag)
+    kind = extended(Tank, lag)
+    assert place_of(Tank()) == "operating_point"
+    assert "extended(Tank, ...)" in place_of(kind())
+    kind.operating_point = OperatingPoint((1.0,), (0.5,))
+    with pytest.raises(
+        InputError, match=r"TankExtended.*x must have 2 numbers \(level, acting\).*HM-MACHINE-049"
+    ):
+        kind()

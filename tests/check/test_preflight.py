@@ -193,9 +193,9 @@ IN_BOTH = {
         balance(lambda x, u, m: m.log(x.warmth), lambda x, u, m: -0.1 + 0 * x.warmth, unit="1"), "HM-CHECK-056",
     ),
     "balance of nothing": (balance(nothing, lost, lost), "HM-CHECK-055"),
-    "operating point of one": (members(operating_point=OperatingPoint((0.2,), (0.1,))), "HM-CHECK-044"),
+    "operating point of one": (members(operating_point=OperatingPoint((0.2,), (0.1,))), "HM-MACHINE-049"),
     "operating point out of range": (members(operating_point=OperatingPoint((0.2, 100.0), (0.1,))), "HM-CHECK-045"),
-    "operating point of numbers": (members(operating_point=(0.2, 9.0)), "HM-CHECK-043"),
+    "operating point of numbers": (members(operating_point=(0.2, 9.0)), "HM-MACHINE-048"),
     "parameters of one name": (
         members(parameters=(*Tank.parameters, Parameter("k", 1.0, "-", 0.0, 2.0))), "HM-CHECK-036",
     ),

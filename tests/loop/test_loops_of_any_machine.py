@@ -1,5 +1,7 @@
 """Closed loops of machines that are no pendulum: no offset; what is measured is known ahead; safe is what is said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from closed_loop_parts import FakeClock, ScriptedMonitor
@@ -18,6 +20,7 @@ from hybrid_mpc import (
     Mode,
     Runner,
     SafeController,
+    Signal,
     offset_free,
     simulate,
     with_input_delay,
@@ -82,6 +85,27 @@ def test_a_set_point_beyond_reach_is_reported_and_the_nearest_is_taken():
     nearest = 0.68524182  # both tanks' rest at the pump's largest flow and this inflow
     np.testing.assert_allclose(result.y[-1, 0], nearest, rtol=1e-4)
     np.testing.assert_allclose(result.u[-1, 0], 4e-4, rtol=1e-4)
+
+
+def test_a_set_point_outside_the_range_of_its_signal_is_refused_at_the_start_and_shown_in_the_loop():
+    """20 for 0.2 m, of which the range says 0 to 2 m; an output without weight may have any reference."""
+    model = replace(two_tanks(dt=10.0), outputs=(Signal("lower", "m", 0.0, 2.0),))
+    parts = observer(model, [2e-6]), CondensedController(model, TANKS)
+    with pytest.raises(InputError, match=r"lower = 20 m .* 0 to 2 m.*HM-LOOP-054"):
+        Loop(*parts, reference=[20.0])
+    loop = Loop(*parts, reference=[0.2])
+    with pytest.raises(InputError, match="HM-LOOP-054"):
+        loop.start([0.2], reference=[[0.2], [-1.0]])
+    loop.start([0.2])
+    assert loop.beyond == ""
+    loop.step([0.2], reference=[[20.0]])
+    assert "lower = 20 m" in loop.beyond
+    result = closed(
+        model, TANKS, parts[0], MachinePlant(model), lambda t: np.where(t < 50, 0.3, 20.0)[:, None], 100.0
+    )
+    np.testing.assert_array_equal(result.reached, result.t < 50)
+    motor = dc_motor()
+    Loop(observer(motor, None), CondensedController(motor, MOTOR), reference=[1e9, 1.0])
 
 
 def inflow(t):

@@ -161,6 +161,35 @@ def test_a_stopped_command_goes_on_after_its_last_step(machine, files, tmp_path,
     assert found.explanation.steps[0].terms[0].made.maker == "coulomb"
 
 
+def test_a_search_goes_on_or_ends_with_another_number_of_steps(machine, files, tmp_path, monkeypatch):
+    settings, out, whole = (
+        RunSettings(str(machine / "my_machine.py"), files),
+        tmp_path / "out",
+        explain_search.search,
+    )
+
+    def stopped(*given, on_step, **more):
+        def kept(told):
+            on_step(told)
+            raise KeyboardInterrupt
+
+        return whole(*given, on_step=kept, **more)
+
+    monkeypatch.setattr(explain_search, "search", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        hm.explain(settings, out, terms=LAWS)
+    monkeypatch.setattr(explain_search, "search", whole)
+    first = hm.explain(settings, out, terms=LAWS, most=1)
+    assert len(first.explanation.found) == 1
+    assert (out / RESULT).is_file()
+    more = hm.explain(settings, out, terms=LAWS, most=2).explanation
+    assert more.steps[0] == first.explanation.steps[0]
+    assert more.reason != first.explanation.reason  # the second step was searched
+    monkeypatch.setattr(explain_search, "search", None)
+    for most in (1, 2, 8):
+        assert hm.explain(settings, out, terms=LAWS, most=most).explanation == more
+
+
 def test_what_it_refuses(machine, files, tmp_path, call):
     path = machine / "my_machine.py"
     few = write(tmp_path / "few.csv", recording(3, seconds=3.0))

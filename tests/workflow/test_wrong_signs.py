@@ -10,6 +10,8 @@ from machine_runs import finish
 from wrong_signs import MACHINE, SIMULATED, TRUTH, WRONG_LOAD, WRONG_TORQUE, written
 
 from hybrid_mpc import InputError, RunSettings, check_fit, load, load_scenario, run
+from hybrid_mpc.engine import Progress
+from hybrid_mpc.workflow.check_fit import long_windows
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.stages.choose import CHOICE
 from hybrid_mpc.workflow.stages.promises import STRUCTURE
@@ -28,9 +30,43 @@ def settings(words: list[str]) -> RunSettings:
     return RunSettings(words[0], tuple(Path(word) for word in words[2::2]))
 
 
+class Told(Progress):
+    """Keeps titles of stages and texts of their parts."""
+
+    def __init__(self):
+        self.titles, self.texts = [], []
+
+    def start(self, title):
+        self.titles.append(title)
+
+    def update(self, key, done, total, text):
+        self.texts.append(text)
+
+
 @pytest.fixture(scope="module")
-def checked(words):
-    return {name: check_fit(settings(own)) for name, own in words.items()}
+def told():
+    return {name: Told() for name in CASES}
+
+
+@pytest.fixture(scope="module")
+def checked(words, told):
+    return {name: check_fit(settings(own), told[name]) for name, own in words.items()}
+
+
+def test_the_search_for_wrong_terms_reports_its_parts(checked, told):
+    searching = {text for text in told["wrong load"].texts if text.startswith("looking for wrong terms: ")}
+    assert len(searching) >= 3
+    assert not any("free_run" in title for title in told["wrong load"].titles)
+
+
+def test_long_windows_are_reported_before_the_fit(words, monkeypatch):
+    scenario = load_scenario(words["right"][0])
+    context = Context(settings(words["right"]), scenario, Path())
+    assert long_windows(context) == ""
+    monkeypatch.setattr("hybrid_mpc.workflow.check_fit.MANY", 10)
+    assert "free_run" in long_windows(context)
+    limited = replace(scenario, data=replace(scenario.data, free_run=9.0))
+    assert long_windows(Context(settings(words["right"]), limited, Path())) == ""
 
 
 def test_a_right_prior_is_fitted_and_not_doubted(checked):

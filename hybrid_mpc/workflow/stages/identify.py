@@ -355,9 +355,13 @@ def examined_prior(context: Context) -> PriorResult:
     compared = baselines if not growth else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
     acting, unit = shifted(train, fit.delay), context.time_unit
-    context.progress.update("free runs", 1, 1, "looking for wrong terms")
     off = zip(errors["phy"].rmse.items(), smoother.sizes.y, strict=True)
-    wrong = named(causes(make, fit.values, acting, spec.dt, length, unit))
+
+    def searching(text: str) -> None:
+        context.progress.update("free runs", 1, 1, f"looking for wrong terms: {text}")
+
+    searching("smoothing the recordings")
+    wrong = named(causes(make, fit.values, acting, spec.dt, length, unit, searching))
     lacks = [bounds_doubt(bounds, len(fit.standard_errors))]
     # where small errors grow, errors of initial states grow too: then the windows of the fit, with free initial states,
     # test the equations
