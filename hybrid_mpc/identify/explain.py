@@ -1026,6 +1026,9 @@ class _Pictures:
         if term.place == "output":
             k = _index(self.base, term)
             return self._shown(without=term)[:, k], self.base.outputs[k].label
+        if term.place == "inertia":
+            k = _index(self.base, term)
+            return self.xdot[:, k], f"d({term.of})/dt [{self.base.states[k].unit}/s]"
         options = {} if term.made is None else term.made.options
         name = str(options.get("source") or options.get("one") or term.of)
         positions = {self.base.states[v].name: self.base.states[q].name for q, v in self.base().kinematics}

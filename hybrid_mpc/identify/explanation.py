@@ -93,8 +93,8 @@ class FoundTerm:
         name: Its name, e.g. ``"Coulomb friction of phi_dot"``.
         formula: Formula of the added term, or of the signal that replaces the original one.
         explanation: Description in a sentence.
-        place: Place in the prior: ``"force"``, ``"potential"``, ``"rate"``, ``"input"``, ``"disturbance"``,
-            ``"output"``.
+        place: Place in the prior: ``"force"``, ``"potential"``, ``"inertia"``, ``"rate"``, ``"input"``,
+            ``"disturbance"``, ``"output"``.
         of: The speed, state, input, disturbance or output.
         code: The call that creates the term, for a file; empty for a user's own term without one.
         made: The call as data, for :meth:`Explanation.prior`; None for a user's own term.

@@ -74,7 +74,7 @@ class _Library:
         self.prior, self.dt, self.length = prior, dt, length
         self.x, self.u, self.w = points
         rates = prior.equations.xdot(self.x.T, self.u.T, self.w.T, prior.p).full().T
-        self.rates = np.sqrt(np.mean(np.square(rates), axis=0))
+        self.rates = self.accelerations = np.sqrt(np.mean(np.square(rates), axis=0))
         self.changes = dt * self.rates
         self.units = [f"{s.unit}/s" for s in prior.states]
         self.positions = {v: q for q, v in prior.kinematics}
@@ -159,6 +159,8 @@ class _Library:
         yield laws.offset(own, weight("F_0", 1.0, words="offset"), place=place)
         if not self.mechanical:
             return
+        most = self._weight(i, "J", float(self.accelerations[i]), positive=True, words="inertia")
+        yield laws.inertia(own, replace(most, unit="kg m^2" if self.units[i] == "N m" else "kg"))
         if turning:
             yield laws.gravity_error(
                 own, weight("G_s", 0.7, words="gravity by sin q"), weight("G_c", 0.7, words="by cos q")

@@ -19,7 +19,7 @@ from hybrid_mpc.machine.signals import Parameter, Signal
 
 GROUPS: Mapping[str, str] = {
     "Axes": "coulomb asymmetric viscous viscous_by_direction quadratic stribeck loaded coulomb_by_position offset "
-    "gravity_error cogging spring elastic_end",
+    "gravity_error cogging spring elastic_end inertia",
     "Processes": "loss storage radiation overflow coupling product",
     "Inputs": "input_gain input_offset input_curve saturation input_lag input_delay gain_by_direction dead_zone",
     "Measured disturbances": "disturbance_gain disturbance_offset disturbance_lag",

@@ -25,8 +25,10 @@ from hybrid_mpc.machine.signals import Parameter, Signal
 from hybrid_mpc.records import Fields
 from hybrid_mpc.rules import Line, Name
 
-Place: TypeAlias = Literal["force", "potential", "rate", "input", "disturbance", "output"]
-PLACES: tuple[Place, ...] = ("force", "potential", "rate", "input", "disturbance", "output")
+Place: TypeAlias = Literal["force", "potential", "inertia", "rate", "input", "disturbance", "output"]
+PLACES: tuple[Place, ...] = ("force", "potential", "inertia", "rate", "input", "disturbance", "output")
+MECHANICAL: tuple[Place, ...] = ("force", "potential", "inertia")
+"""Places of mechanical priors, in the order in which they act."""
 Option: TypeAlias = Signal | tuple[float, ...] | bool | float | str
 
 
@@ -117,11 +119,13 @@ class Term:
     Args:
         name: Name of the term, e.g. ``"Coulomb friction of phi_dot"``.
         place: Place in the prior: ``"force"`` adds a generalised force to a mechanical prior's speed ``of``,
-            ``"potential"`` an energy of its position, ``"rate"`` adds to the rate of the state ``of``; ``"input"``,
-            ``"disturbance"`` and ``"output"`` replace the acting or the measured signal.
+            ``"potential"`` an energy of its position, ``"inertia"`` an inertia of its axis; ``"rate"`` adds to the
+            rate of the state ``of``; ``"input"``, ``"disturbance"`` and ``"output"`` replace the acting or the
+            measured signal.
         of: Name of the speed, state, input, disturbance or output.
         parameters: Its parameters; the term has almost no effect if the first one is zero, or at its nominal value.
-        law: ``(at, p) -> value``: the force or rate that is added, the energy, or the signal in place of ``at.own``.
+        law: ``(at, p) -> value``: the force, inertia or rate that is added, the energy, or the signal in place of
+            ``at.own``.
             With a state ``(value, rate)``. ``p`` are its parameters in order, by name.
         text: Its formula.
         loss: Whether the term is a loss of a balance, like friction. Default: it is a supply.
@@ -180,8 +184,8 @@ def extended(base: type[Prior], *terms: Term) -> type[Prior]:
 
     Raises:
         InputError: With all problems: a signal of a term is missing, a parameter or state appears twice, a force is
-            added to a prior that is not mechanical, units do not match, or a potential depends on more than its
-            position.
+            added to a prior that is not mechanical, units do not match, a potential depends on more than its
+            position, or an inertia is not constant.
 
     Example:
         >>> class Disk(MechanicalPrior):
@@ -328,9 +332,12 @@ def _expressions(
     added, lost, stored = ca.SX.zeros(n_x), ca.SX.zeros(n_x), ca.SX(0)
     names = prior.names_of("x")
     positions = {names[v]: q for q, v in prior.kinematics}
-    for term in terms:
-        if term.place not in ("force", "potential", "rate"):
-            continue
+    half = n_x // 2
+    mass: Any = (
+        _masses(cast(Any, base))(x_base[:half], of_base) if issubclass(base, MechanicalPrior) else None
+    )
+    adding = [term for term in terms if term.place in (*MECHANICAL, "rate")]
+    for term in sorted(adding, key=lambda term: PLACES.index(term.place)):
         i = names.index(term.of)
         q = positions.get(term.of)
         driven, resting = _forces(base, x_base, u, w, of_base, term, i)
@@ -344,9 +351,14 @@ def _expressions(
         if term.place == "rate":
             change[i] = value
         else:
-            force = ca.SX.zeros(n_x // 2)
-            force[i - n_x // 2] = value
-            change[n_x // 2 :] = ca.solve(_masses(cast(Any, base))(x_base[: n_x // 2], of_base), force)
+            force = ca.SX.zeros(half)
+            force[i - half] = value
+            if term.place == "inertia":
+                # (M + J) a' = M a, so a' - a = -(M + J)^-1 J a; the energy J v^2 / 2 is stored
+                stored = stored + 0.5 * value * x_base[i] ** 2
+                mass = mass + ca.diag(force)
+                force = -force * (rates + added)[half:]
+            change[half:] = ca.solve(mass, force)
         added = added + change
         if term.loss:
             lost = lost + change
@@ -432,16 +444,16 @@ def _check(base: type[Prior], terms: tuple[Term, ...]) -> None:
             problems.append(
                 f"{where}: there is no {term.of!r}; choose from {', '.join(names)}. [HM-MACHINE-034]"
             )
-        elif term.place in ("force", "potential") and not issubclass(base, MechanicalPrior):
+        elif term.place in MECHANICAL and not issubclass(base, MechanicalPrior):
             problems.append(
-                f"{where}: a {term.place} needs a MechanicalPrior. Use place='rate'. [HM-MACHINE-035]"
+                f"{where}: place {term.place!r} needs a MechanicalPrior. Use place='rate'. [HM-MACHINE-035]"
             )
-        elif term.place in ("force", "potential") and term.of not in moving:
+        elif term.place in MECHANICAL and term.of not in moving:
             problems.append(
                 f"{where}: {term.of!r} is no speed; choose from {', '.join(sorted(moving))}. [HM-MACHINE-036]"
             )
-        if term.state is not None and term.place in ("force", "potential"):
-            problems.append(f"{where}: a {term.place} cannot have a state of its own. [HM-MACHINE-037]")
+        if term.state is not None and term.place in MECHANICAL:
+            problems.append(f"{where}: place {term.place!r} cannot have a state of its own. [HM-MACHINE-037]")
     if not problems:
         problems = [problem for term in terms for problem in _misfits(base, prior, term)]
     for what, every in (
@@ -483,8 +495,10 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
             power = "N m" if term_units.of(base.states[q].unit) == term_units.NONE else "N"
     if term.place == "rate":
         wanted = term_units.per_second(wanted)
-    elif term.place in ("force", "potential"):
+    elif term.place in MECHANICAL:
         wanted = term_units.of("J" if term.place == "potential" else power or "N")
+        if term.place == "inertia":
+            wanted = term_units.of("kg m^2" if power == "N m" else "kg")
     driven, resting = ca.SX.sym("driven"), ca.SX.sym("resting")
     given = [ca.SX.sym(q.name) for q in term.parameters]
     inputs += [(v, q.unit) for v, q in zip(given, term.parameters, strict=True)]
@@ -501,15 +515,12 @@ def _misfits(base: type[Prior], prior: Prior, term: Term) -> Iterator[str]:
     for one, needed in parts:
         if said := term_units.clash(one, inputs, needed):
             yield f"{where}: units do not match: {said}. Correct the unit of a parameter, or the law. [HM-MACHINE-042]"
-    if term.place == "potential":
-        free = [
-            v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not position
-        ]
+    if term.place in ("potential", "inertia"):
+        known = position if term.place == "potential" else None
+        free = [v for v in (*symbols["x"], *symbols["u"], *symbols["w"], driven, resting) if v is not known]
         if ca.depends_on(ca.SX(value), ca.vertcat(*free)):
-            yield (
-                f"{where}: a potential may only depend on its position, else the energy balance is wrong. Use a force "
-                "[HM-MACHINE-043]"
-            )
+            only = "may only depend on its position" if term.place == "potential" else "must be constant"
+            yield f"{where}: the {term.place} {only}, else the energy balance is wrong. Use a force [HM-MACHINE-043]"
 
 
 def _uneven(term: Term) -> Term:
@@ -708,6 +719,11 @@ def spring(of: str, stiffness: Parameter, *, centre: float) -> Term:
         "spring", "spring", "potential", of, (stiffness,), lambda at, p: 0.5 * p[0] * (at.position - centre) ** 2,
         f"-{stiffness.name} (q - {centre:.3g})", centre=centre,
     )  # fmt: skip
+
+
+def inertia(of: str, j: Parameter) -> Term:
+    """More inertia of one axis alone, such as that of a geared rotor: the force ``-j dv/dt``."""
+    return _added("inertia", "inertia", "inertia", of, (j,), lambda at, p: p[0], f"-{j.name} d({of})/dt")
 
 
 def elastic_end(of: str, stiffness: Parameter, *, edge: float, upper: bool) -> Term:
@@ -1011,6 +1027,7 @@ EXPLANATIONS: Mapping[str, str] = {
     "cogging": "A torque is periodic in the position: cogging, or an eccentric shaft.",
     "spring": "A spring, such as a cable or hose, pulls towards one position.",
     "elastic_end": "An elastic stop acts near the end of the travel.",
+    "inertia": "An axis has more inertia, e.g. that of its motor behind a gear.",
     "loss": "A loss to the surroundings or to another state.",
     "radiation": "Heat is lost by radiation.",
     "storage": "A second capacity, such as a wall, stores and releases with its own time constant.",

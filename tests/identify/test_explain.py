@@ -69,10 +69,26 @@ def recorded(prior, count=6, seconds=8.0, seed=0):
     return runs
 
 
-def searched(plant):
+class PointMass(Pendulum):
+    """A pendulum as a point mass: its weight gives its inertia."""
+
+    parameters = (
+        Parameter("m", 0.6, "kg", 0.1, 2.0),
+        Parameter("l", 0.3, "m", 0.3, 0.3),
+        Parameter("d", 0.03, "N m s/rad", 0.0, 0.5),
+    )
+
+    def mass_matrix(self, q, p):
+        return p.m * p.l**2
+
+    def potential(self, q, p):
+        return -9.81 * p.m * p.l * ca.cos(q.phi)
+
+
+def searched(plant, base=Pendulum):
     runs = recorded(plant)
-    fit = fit_prior(Pendulum, runs, [], dt=DT, length=2.0)
-    return explain(Pendulum, fit.values, smoothed(Pendulum, fit, runs, DT), dt=DT, length=2.0)
+    fit = fit_prior(base, runs, [], dt=DT, length=2.0)
+    return explain(base, fit.values, smoothed(base, fit, runs, DT), dt=DT, length=2.0)
 
 
 def test_dry_friction_that_is_missing_is_found():
@@ -101,6 +117,15 @@ def test_dry_friction_that_is_missing_is_found():
     x, u = [0.4, 2.0], [0.7]
     wanted = extended(Pendulum, *found.terms())(found.values).equations.xdot(x, u, [], made.p)
     np.testing.assert_array_equal(made.equations.xdot(x, u, [], made.p).full(), wanted.full())
+
+
+def test_a_missing_inertia_of_a_single_axis_is_named_beside_a_weight_that_explains_as_much():
+    """With another mass, ``m l^2 phi'' = u - (m l - G) sin phi`` is the same motion."""
+    rotor = terms.inertia("phi_dot", Parameter("J", 0.02, "kg m^2", 0.0, 1.0))
+    (step,) = searched(extended(PointMass, rotor)(), PointMass).steps
+    assert step.held_out.ratio < 0.5
+    named = {step.name, *(trial.terms[0].name for trial in step.alternatives)}
+    assert {"gravity error of phi_dot", "inertia of phi_dot"} <= named
 
 
 def test_no_term_is_added_where_none_is_missing():

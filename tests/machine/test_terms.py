@@ -70,6 +70,7 @@ def arm_terms(value):
         "cogging": terms.cogging("v2", one, two, periods=4.0),
         "spring": terms.spring("v1", of("N m/rad"), centre=0.1),
         "end": terms.elastic_end("v1", of("N m/rad"), edge=-0.2, upper=True),
+        "inertia": terms.inertia("v2", of("kg m^2")),
         "gain": terms.input_gain("t1", of("-")),
         "input offset": terms.input_offset("t1", one),
         "by direction": terms.gain_by_direction("t2", of("-")),
