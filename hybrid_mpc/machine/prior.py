@@ -181,7 +181,7 @@ class Prior:
             )
         for key in "xuw" if point else "":
             names, given = self.names_of(key), getattr(point, key)
-            if len(given) != len(names):
+            if len(given) != len(names) and (given or key != "w"):  # without w: the middle of its range
                 of_terms = (
                     ". The states of terms belong to the class that extended(...) returns: set its operating_point "
                     "after that line" if key == "x" and len(given) > len(names) else ""
