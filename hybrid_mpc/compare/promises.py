@@ -973,6 +973,8 @@ def largest_violation(
             name, _, unit = label.rstrip("]").rpartition(" [")
             text = f"largest violation in the run's loops: {by_signal[label]:.2g} {unit} of {name} in task {task}"
             text += f" {where} (noise {noise[label]:.2g} {unit})"
+            if not by_signal[label] > 0:
+                text = f"no bound of a state or output is violated in the run's loops {where}".rstrip()
             found.append((float(by_signal[label] / noise[label]), text))
     return max(found)
 

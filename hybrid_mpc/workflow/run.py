@@ -41,7 +41,7 @@ ALWAYS = (TASKS.name, REPORT.name)
 """Stages that run even if ``only`` does not name them: they only write what scenario and other stages hold."""
 SECONDS = {
     "data": 4, "explain": 20, "prior": 22, "training": 26, "choice": 5, "evaluation": 4, "export": 7, "track": 30,
-    "noise": 5, "tasks": 1, "control": 26, "on_model": 14, "estimation": 1, "promises": 7, "watch": 33, "analysis": 1,
+    "noise": 5, "tasks": 1, "control": 26, "on_model": 14, "estimation": 1, "promises": 7, "watch": 39, "analysis": 1,
     "report": 12,
 }  # fmt: skip
 """Duration of each stage of `make demo` on two idle cores [s]; ``on_model`` only runs without a plant. The remaining
