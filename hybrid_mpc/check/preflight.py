@@ -549,7 +549,7 @@ def _check_task(
 
 def _check_within(name: str, values: Array, t: Array, signals: Sequence[Signal]) -> None:
     for j, signal in enumerate(signals):
-        beyond = (values[:, j] < signal.lower) | (values[:, j] > signal.upper)
+        beyond = signal.outside(values[:, j])
         if beyond.any():
             k = int(np.argmax(beyond))
             raise InputError(

@@ -849,17 +849,15 @@ def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
 def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
     """Row "late inputs": a loop on the model itself, with inputs that act later than in the model.
 
-    It starts beside the set-point, by the spread of the controlled outputs in the recordings.
-
-    The linearized loop shows small motions alone: at the limits of the inputs, a large motion can start swings that
-    never end.
+    It starts beside the set-point, by the spread of the controlled outputs in the recordings. The linearized loop shows
+    small motions only: at the limits of the inputs, a large motion can start swings that never end.
 
     Args:
         point: The set-point.
         lacking_s: Delay [s] that the recordings show and the model lacks. Default: none; then one period.
 
     Returns:
-        None if the loop does not settle without a delay either: other rows name the reason.
+        None if the loop does not settle without a delay either (other rows name the reason), or if a spread is unknown.
     """
     model, (x, u) = point.model, point.rest
     slopes = output_with_jacobian(model)(x, u, point.w)[1].full()[point.held]
@@ -870,20 +868,20 @@ def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
     start = np.clip(start, *np.array([(s.lower, s.upper) for s in model.states]).T)
     late, periods = max(1, math.ceil(lacking_s / model.dt - ROUNDING)), LASTS * point.problem.horizon
     plant = ModelPlant(model, tuple(point.sigma))
-    if tried(point, plant, start, periods).why:
+    if not np.isfinite(start).all() or tried(point, plant, start, periods).why:
         return None
-    sizes_of = zip(point.held, np.abs(slopes @ (start - x)), strict=True)
     moved = ", ".join(
-        f"{model.outputs[i].name} by {size:.2g} {model.outputs[i].unit}" for i, size in sizes_of
+        f"{model.outputs[i].name} by {size:.2g} {model.outputs[i].unit}"
+        for i, size in zip(point.held, np.abs(slopes @ (start - x)), strict=True)
     )
-    told = (
-        "" if not lacking_s else f"; in the recordings inputs act {lacking_s:.2g} s later than in the prior"
+    recorded = (
+        f"; in the recordings inputs act {lacking_s:.2g} s later than in the prior" if lacking_s else ""
     )
     found = tried(point, plant, start, periods, late=late)
     when = f"after a deviation ({moved}) with inputs {counted(late, 'period')} late"
     if not found.why:
-        return Promise(LATE_INPUTS, "shown", f"the loop on the model itself settles {when}{told}")
-    evidence = f"the loop on the model itself does not settle {when}: {found.worst}{told}"
+        return Promise(LATE_INPUTS, "shown", f"the loop on the model itself settles {when}{recorded}")
+    evidence = f"the loop on the model itself does not settle {when}: {found.worst}{recorded}"
     return Promise(LATE_INPUTS, "doubted", evidence, LATE)
 
 

@@ -141,7 +141,7 @@ def beyond_range(reference: Array, problem: Problem) -> str:
     ocp, model = problem.ocp, problem.model
     weights, signals = (ocp.q_y, model.outputs) if ocp.n_y else (ocp.q, model.states)
     for weight, s, column in zip(weights, signals, reference.T, strict=False):  # further columns: parameters
-        wrong = column[(column < s.lower) | (column > s.upper)]
+        wrong = column[s.outside(column)]
         if weight > 0 and wrong.size and not s.periodic:
             return (
                 f"{s.name} = {wrong[0]:g} {s.unit} is outside its range {s.lower:g} to {s.upper:g} {s.unit}"

@@ -88,6 +88,19 @@ class Signal:
         """Factor from a periodic signal's unit to radians, exactly 1 for ``rad``; 0 if the signal is not periodic."""
         return 2.0 * math.pi / self.period
 
+    def outside(self, values: ArrayLike) -> NDArray[np.bool_]:
+        """Which ``values`` [unit] lie outside the range, apart from rounding: 1e-9 of the range or of its one end.
+
+        Example:
+            >>> Signal("level", "m", 0.0, 0.3).outside([0.1 + 0.2, 0.301, -1e-17]).tolist()
+            [False, True, False]
+        """
+        given, ends = np.asarray(values, dtype=np.float64), (self.lower, self.upper)
+        size = self.upper - self.lower
+        if not math.isfinite(size):
+            size = max((abs(end) for end in ends if math.isfinite(end)), default=0.0)
+        return np.asarray((given < self.lower - 1e-9 * size) | (given > self.upper + 1e-9 * size))
+
     @property
     def label(self) -> str:
         """Name with unit, as plots and tables print it."""
