@@ -67,12 +67,13 @@ def explain(
 
 def summary(found: ExplainResult, folder: Path) -> list[str]:
     """The result in a few lines."""
-    from hybrid_mpc.workflow.explain_page import ALONE
+    from hybrid_mpc.identify.explain import FEWEST
+    from hybrid_mpc.workflow.explain_page import FEW
 
     explanation = found.explanation
     lines = [f"evaluated on {explanation.evidence.text}, in free runs of {explanation.evidence.length:.3g} s"]
-    if explanation.evidence.recordings == 1:
-        lines.append(ALONE)
+    if explanation.evidence.recordings < FEWEST:
+        lines.append(FEW)
     if explanation.steps:
         lines.append(f"errors: all samples together; ratios: {explanation.averaged}")
     if not explanation.found:
@@ -97,7 +98,7 @@ def _steps(found: ExplainResult) -> Table:
     table.add_row("prior, fitted", f"{explanation.before:.3g}", "", "", "")
     for step in explanation.steps:
         table.add_row(
-            signed(step), f"{step.held_out.error:.3g}", step.held_out.words, values_of(step), alternatives_of(step)
+            signed(step), f"{step.held_out.error:.3g}", step.words, values_of(step), alternatives_of(step)
         )  # fmt: skip
     return table
 

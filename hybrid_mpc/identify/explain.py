@@ -59,7 +59,8 @@ BLOCKS = 8
 WINDOWS = 48
 """Maximum number of windows of the search, shared evenly by the recordings; twice as many for short windows."""
 SHORTER = 5
-"""Ratio of the lengths of long and short windows; short windows also score and start candidates."""
+"""Ratio of the lengths of long and short windows. Short windows also score, start and evaluate candidates: small errors
+of a force are seen where large ones have not yet grown over a long free run."""
 TRIED = 3
 """Number of candidates of a step that are fitted in every fold."""
 PAIRS = 3
@@ -80,8 +81,8 @@ GAIN = 0.7
 with a large reduction does not widen the interval."""
 POOR = 0.7
 """Relative error of a model that explains half of the outputs' variance. If the error with a term is larger, only a
-ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance. The same holds where all
-evidence is one recording: its blocks do not show what differs in the next."""
+ratio below ``GAIN`` counts, because small reductions of such free runs occur by chance. The same holds with fewer than
+``FEWEST`` recordings: their blocks do not show what differs in the next."""
 DOUBT = 0.1
 """Probability that the ratio exceeds one bound of its interval, for all fitted candidates of a step together. A term is
 added if the upper bound is below 1."""
@@ -95,10 +96,10 @@ SMALL = 0.1
 """Share of the smaller mean squared error that is added to the mean squared error of every piece. So pieces in which
 both models have small errors have little influence."""
 FEWEST, MANY = 3, 5
-"""Minimum number of pieces of evidence for an interval; number of recordings from which on each recording is one
-piece."""
+"""Minimum number of pieces of evidence for an interval, and of recordings for small gains; number of recordings from
+which on each recording is one piece."""
 GENERIC = ("product", "coupling")
-"""Laws that are no candidates where all evidence is one recording: they adapt to any variation within the recording."""
+"""Laws that are no candidates with fewer than ``FEWEST`` recordings: they adapt to any variation within a recording."""
 LEAST_T = 2.0
 """Minimum t-ratio: at least one weight of each new term must differ from zero by this many standard errors."""
 LEAST = 20
@@ -174,6 +175,27 @@ class _HeldOut:
             if mean + wide < 0:
                 return math.ceil((pieces - n) * self.summary.recordings / n)
         return 0
+
+    def doubt(self, found: HeldOutError, squares: Array, before: Array, candidates: int) -> str:
+        """Why the evidence does not suffice to add a candidate with these squared errors; empty if it does."""
+        said = f"the error ratio with to without the term is {found.words}"
+        if found.ratio >= ADDED:
+            return said
+        if squares.sum() >= before.sum():
+            return f"{said}, but the error over all samples is not smaller"
+        if found.upper >= 1.0:
+            more = self.needed(squares, before, candidates)
+            return f"{said}: not significant" + (
+                f"; {more} more such recordings would show the effect" if more else ""
+            )
+        if self.summary.recordings < FEWEST and found.ratio > GAIN:
+            return (
+                f"{said}, but must be below {GAIN:g} with less than {FEWEST} recordings: add "
+                f"{counted(FEWEST - self.summary.recordings, 'recording')}"
+            )
+        if found.error > POOR and found.ratio > GAIN:
+            return f"{said}: with a relative error of {found.error:.2f}, a ratio above {GAIN:g} may be due to chance"
+        return ""
 
     def _each(self, own: Array, other: Array) -> Array:
         """Logarithm of the ratio of errors of each piece of evidence."""
@@ -351,13 +373,13 @@ class _Search:
         found = step(first, *(c.T for c in columns), np.tile(own_p[:, None], n)).full().ravel()
         return np.concatenate([first, found[:-1]])
 
-    def held_out(self, terms: Terms, theta: Array) -> Array:
+    def held_out(self, by: _HeldOut, terms: Terms, theta: Array) -> Array:
         """Squared errors ``(n, T + 1)`` of every window with a fit to the other folds, which starts from ``theta``."""
-        squares = np.zeros(self.evidence.pieces.shape)
-        for fold in sorted(set(self.evidence.folds.tolist())):
-            held = self.evidence.folds == fold
-            fitted = self.problem(terms, self.evidence.rows(~held)).solve(theta, ITERATIONS).theta
-            squares[held] = _squares(self.judged(self.evidence, terms, fitted, held), fitted)
+        squares = np.zeros(by.pieces.shape)
+        for fold in sorted(set(by.folds.tolist())):
+            held = by.folds == fold
+            fitted = self.problem(terms, by.rows(~held)).solve(theta, ITERATIONS).theta
+            squares[held] = _squares(self.judged(by, terms, fitted, held), fitted)
         return squares
 
     def start(self, terms: Terms, theta: Array) -> Array:
@@ -473,6 +495,11 @@ class _Promises:
         return 0.5 * math.log(self._left(columns) / self.plain)
 
 
+def _free(terms: Sequence[Term]) -> int:
+    """Number of parameters that are fitted."""
+    return sum(not p.fixed for term in terms for p in term.parameters)
+
+
 def _with_state(terms: Sequence[Term]) -> list[Term]:
     """Terms with a state, in order."""
     return [term for term in terms if term.state is not None]
@@ -518,6 +545,7 @@ class _Fitted:
     reason: str = ""
     sure: bool = False
     worse: bool = False
+    short: HeldOutError | None = None
 
 
 @dataclass(frozen=True)
@@ -620,14 +648,15 @@ class _Explain:
         periods = min(periods_of(length, dt, 2), longest)
         self.evidence = _gathered(known, prior, periods, round(warm_up / dt), WINDOWS)
         less = max(periods // SHORTER, min(periods, 2 * SHORTEST))
-        short = _gathered(known, prior, less, round(warm_up / dt), 2 * WINDOWS)
+        self.short = _gathered(known, prior, less, round(warm_up / dt), 2 * WINDOWS)
+        self.shorter: dict[Terms, Array] = {}
         points = visited(known)
         sizes = np.array([robust_spread(c) or 1.0 for c in np.concatenate([t.x for t in known]).T])
         y = self.evidence.windows.y
         spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
-        self.search = _Search(base, dt, self.evidence, short, sizes, points, spread)
+        self.search = _Search(base, dt, self.evidence, self.short, sizes, points, spread)
         given = library(prior, points, dt, length) if candidates is None else candidates
-        if self.evidence.summary.recordings == 1:
+        if self.evidence.summary.recordings < FEWEST:
             given = [one for one in given if not _is_generic(one)]
         self.pool = [*given, *(Candidate(term.name, (term,)) for term in own)]
         _check(prior, self.pool, own, points)
@@ -637,7 +666,7 @@ class _Explain:
         theta = (
             search.problem((), self.evidence.windows).solve(search.fit(()).scaled(values), ITERATIONS).theta
         )
-        self.first = search.held_out((), theta)
+        self.first = search.held_out(self.evidence, (), theta)
         self.nominal = math.sqrt(search.error((), search.fit(()).nominal))
         self.now = _State((), theta, self.first)
 
@@ -664,7 +693,7 @@ class _Explain:
         search = self.search
         theta = search.fit(terms).scaled({**search.fit(terms).prior.values, **begun.values})
         self.steps = list(begun.steps)
-        self.now = _State(terms, theta, search.held_out(terms, theta))
+        self.now = _State(terms, theta, search.held_out(self.evidence, terms, theta))
         there = {term.name for step in begun.steps for term in step.terms}
         self.pool = [one for one in self.pool if not there & {form.name for form in one.forms}]
 
@@ -673,12 +702,12 @@ class _Explain:
         number = 1 + sum(step.action == "added" for step in self.steps)
         singles, pairs, diverged = self._scored(number)
         fitted = list(self._fitted(singles.best(TRIED), f"step {number}"))
-        chosen = _chosen(fitted)
+        chosen = self._chosen(fitted)
         if chosen is None:
             some = pairs.best(PAIRS, singles)
             both = list(self._fitted(some, f"step {number}, pairs"))
             fitted += both
-            chosen = _chosen([one for one in both if self._both_needed(one)])
+            chosen = self._chosen([one for one in both if self._both_needed(one)])
         trials = [self._trial(one, chosen) for one in fitted] + diverged
         return tuple(trials), len(self.pool), chosen
 
@@ -739,7 +768,7 @@ class _Explain:
                     yield _Fitted(forms, None, own.theta, np.zeros(0), said, worse=True)
                     continue
                 indistinct = search.indistinct(terms, own, forms)
-                squares = search.held_out(terms, own.theta)
+                squares = search.held_out(self.evidence, terms, own.theta)
             except (InputError, np.linalg.LinAlgError) as error:
                 yield _Fitted(forms, None, np.zeros(0), np.zeros(0), str(error))
                 continue
@@ -748,35 +777,31 @@ class _Explain:
     def _judged(
         self, forms: Terms, theta: Array, squares: Array, candidates: int, indistinct: Sequence[Term]
     ) -> _Fitted:
-        found = self.evidence.compared(squares, self.now.squares, candidates)
-        reason = ""
         if not np.isfinite(squares).all():
             return _Fitted(forms, None, theta, squares, "free runs with the term diverge")
-        if found.ratio >= ADDED or squares.sum() >= self.now.squares.sum():
-            less = "" if found.ratio >= ADDED else ", but the error over all samples is not smaller"
-            reason = f"the error ratio with to without the term is {found.words}{less}"
-        elif found.upper >= 1.0:
-            more = self.evidence.needed(squares, self.now.squares, candidates)
-            reason = f"the error ratio with to without the term is {found.words}: not significant"
-            if more:
-                reason += f"; {more} more such recordings would show the effect"
-        elif self.evidence.summary.recordings == 1 and found.ratio > GAIN:
-            reason = (
-                f"the error ratio with to without the term is {found.words}, but must be below {GAIN:g} for a single "
-                "recording: add a second recording"
-            )
-        elif found.error > POOR and found.ratio > GAIN:
-            reason = (
-                f"the error ratio with to without the term is {found.words}: with a relative error of "
-                f"{found.error:.2f}, a ratio above {GAIN:g} may be due to chance"
-            )
-        elif indistinct:
+        found = self.evidence.compared(squares, self.now.squares, candidates)
+        reason, shorter = self.evidence.doubt(found, squares, self.now.squares, candidates), None
+        if reason and found.ratio < WORTH:
+            own, before = self._short(forms, theta), self._short((), self.now.theta)
+            shorter = self.short.compared(own, before, candidates)
+            if not self.short.doubt(shorter, own, before, candidates):
+                reason = ""
+        if reason:
+            return _Fitted(forms, found, theta, squares, reason, short=shorter)
+        if indistinct:
             reason = (
                 f"the data do not identify the parameters of {', '.join(term.name for term in indistinct)}"
             )
         elif ends := self._at_bounds(forms, theta):
             reason = f"{', '.join(ends)} would end at a bound"
-        return _Fitted(forms, found, theta, squares, reason, not reason)
+        return _Fitted(forms, found, theta, squares, reason, not reason, short=shorter)
+
+    def _short(self, forms: Terms, theta: Array) -> Array:
+        """Squared errors of held-out short runs with the present terms and ``forms``."""
+        terms = (*self.now.terms, *forms)
+        if terms not in self.shorter:
+            self.shorter[terms] = self.search.held_out(self.short, terms, theta)
+        return self.shorter[terms]
 
     def _at_bounds(self, forms: Terms, theta: Array) -> list[str]:
         """Parameters of new terms that end at a bound; such a term replaces another effect."""
@@ -789,6 +814,20 @@ class _Explain:
         ]
         return [p.name for p in fitted if p.at_bound]
 
+    def _chosen(self, fitted: Sequence[_Fitted]) -> _Fitted | None:
+        """The significant candidate with the lowest error, or a simpler one.
+
+        A further parameter must gain as much as a further term: of the candidates that are less than 1 / ``ADDED``
+        worse than the best, the one with the fewest parameters is taken.
+        """
+        sure = [one for one in fitted if one.sure]
+        best = min(sure, key=lambda one: one.held_out.ratio if one.held_out else math.inf, default=None)
+        if best is None:
+            return None
+        ratios = {id(one): self.evidence.compared(one.squares, best.squares, 1).ratio for one in sure}
+        near = [one for one in sure if ratios[id(one)] <= 1.0 / ADDED]
+        return min(near, key=lambda one: (_free(one.forms), ratios[id(one)]))
+
     def _both_needed(self, pair: _Fitted) -> bool:
         """Whether each term of a pair reduces the error in addition to the other."""
         if not pair.sure:
@@ -797,7 +836,7 @@ class _Explain:
         for form in pair.forms:
             kept, theta = self.search.without(terms, pair.theta, form)
             try:
-                alone = self.search.held_out(kept, theta)
+                alone = self.search.held_out(self.evidence, kept, theta)
             except (InputError, np.linalg.LinAlgError):
                 continue  # without this term the model cannot be simulated in every fold
             if self.evidence.compared(pair.squares, alone, 1).ratio >= WORTH:
@@ -817,7 +856,7 @@ class _Explain:
             reason = f"the error ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
         elif one.held_out.ratio < 1.0:
             outcome = "unsure"
-        return Trial(tuple(_found(form) for form in one.forms), outcome, one.held_out, reason)
+        return Trial(tuple(_found(form) for form in one.forms), outcome, one.held_out, reason, one.short)
 
     def _add(self, chosen: _Fitted, scored: int, trials: tuple[Trial, ...]) -> None:
         assert chosen.held_out is not None
@@ -827,7 +866,9 @@ class _Explain:
         )
         found = tuple(_found(form) for form in chosen.forms)
         self.now = _State((*self.now.terms, *chosen.forms), chosen.theta, chosen.squares)
-        self.steps.append(ExplainStep("added", found, chosen.held_out, (), scored, tuple(ranked)))
+        self.steps.append(
+            ExplainStep("added", found, chosen.held_out, (), scored, tuple(ranked), short=chosen.short)
+        )
         added = {form.name for form in chosen.forms}
         self.pool = [one for one in self.pool if not added & {form.name for form in one.forms}]
 
@@ -842,7 +883,7 @@ class _Explain:
                 kept, theta = self.search.without(self.now.terms, self.now.theta, term)
                 try:
                     fitted = self.search.begun(kept, theta)
-                    squares = self.search.held_out(kept, fitted.theta)
+                    squares = self.search.held_out(self.evidence, kept, fitted.theta)
                 except (InputError, np.linalg.LinAlgError):
                     continue  # without this term the model cannot be simulated in every fold
                 found = self.evidence.compared(squares, self.now.squares, 1)
@@ -901,16 +942,10 @@ class _Explain:
             steps=tuple(steps),
             last=last,
             parameters=parameters,
-            evidence=self.evidence.summary,
+            evidence=replace(self.evidence.summary, short=self.short.summary.length),
             candidates=self.candidates,
             reason=reason,
         )
-
-
-def _chosen(fitted: Sequence[_Fitted]) -> _Fitted | None:
-    """Select the candidate with the lowest mean logarithm of the ratio, of those with a significant reduction."""
-    sure = [one for one in fitted if one.sure]
-    return min(sure, key=lambda one: one.held_out.ratio if one.held_out else math.inf, default=None)
 
 
 def _reason(trials: Sequence[Trial], pieces: int) -> str:

@@ -120,12 +120,14 @@ class Trial:
             with the added terms; ``"diverged"``: the fit failed.
         held_out: Error over held-out data; None if the fit failed or did not reduce the error over all data.
         reason: Why the candidate was not added; empty if it was.
+        short: Error over short held-out runs; None if the longer runs suffice.
     """
 
     terms: tuple[FoundTerm, ...]
     outcome: Outcome
     held_out: HeldOutError | None
     reason: str = ""
+    short: HeldOutError | None = None
 
     @property
     def name(self) -> str:
@@ -176,6 +178,7 @@ class ExplainStep:
         scored: Number of candidates that were scored by one Gauss-Newton step.
         trials: Candidates that were fitted, the best first, including the alternatives.
         pictures: Picture of each term; empty for terms that were removed later.
+        short: As ``held_out``, over short runs, if these showed that the terms are needed; otherwise None.
     """
 
     action: Action
@@ -185,11 +188,17 @@ class ExplainStep:
     scored: int
     trials: tuple[Trial, ...] = ()
     pictures: tuple[TermPicture, ...] = ()
+    short: HeldOutError | None = None
 
     @property
     def name(self) -> str:
         """Names of its terms."""
         return _named(self.terms)
+
+    @property
+    def words(self) -> str:
+        """Ratio with its interval; also that over short runs, if these decided."""
+        return self.held_out.words + (f"; short runs {self.short.words}" if self.short else "")
 
     @property
     def alternatives(self) -> tuple[Trial, ...]:
@@ -207,6 +216,7 @@ class Evidence:
         folds: Number of groups that were held out in turn.
         length: Length [s] of the free runs.
         text: The evidence in words.
+        short: Length [s] of the short runs.
     """
 
     recordings: int
@@ -214,6 +224,7 @@ class Evidence:
     folds: int
     length: float
     text: str
+    short: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from hybrid_mpc.identify.explain import ADDED, DOUBT, GAIN, POOR
+from hybrid_mpc.identify.explain import ADDED, DOUBT, FEWEST, GAIN, POOR, WORTH
 from hybrid_mpc.identify.explanation import ExplainStep, Explanation, Trial
 from hybrid_mpc.plots import explain as plots
 from hybrid_mpc.plots.style import save
@@ -17,11 +17,11 @@ from hybrid_mpc.workflow.explained import ExplainResult, state_of
 PAGE = "explain.html"
 RATIO = "ratio to the previous step"
 """Heading of the ratios of errors, on the page and in the terminal."""
-ALONE = (
-    f"The evidence is a single recording: a term must reduce the error by more than {1 - GAIN:.0%}, and products and "
-    "couplings are no candidates."
+FEW = (
+    f"There are fewer than {FEWEST} recordings: a term must reduce the error by more than {1 - GAIN:.0%}, and products "
+    "and couplings are no candidates."
 )
-"""Rule for a single recording."""
+"""Rule for few recordings."""
 SPREADS = "over the outputs' spreads"
 MODELS = {"nominal": "prior, nominal", "fitted": "prior, fitted", "explained": "prior with the found terms"}
 
@@ -100,7 +100,7 @@ def alternatives_of(step: ExplainStep) -> str:
 def steps_table(explanation: Explanation) -> Table:
     """A row a step."""
     rows = [
-        (signed(s), s.held_out.error, s.held_out.words, values_of(s), alternatives_of(s))
+        (signed(s), s.held_out.error, s.words, values_of(s), alternatives_of(s))
         for s in explanation.steps
     ]  # fmt: skip
     return Table(
@@ -112,7 +112,7 @@ def steps_table(explanation: Explanation) -> Table:
         ],
         f"Steps of the search, evaluated on {explanation.evidence.text}. Errors are over all samples. Ratios: "
         f"{explanation.averaged}, with an interval for all fitted candidates of a step together."
-        + (f" {ALONE}" if explanation.evidence.recordings == 1 else ""),
+        + (f" {FEW}" if explanation.evidence.recordings < FEWEST else ""),
     )
 
 
@@ -190,17 +190,19 @@ def _about_terms(explanation: Explanation) -> Sequence[str]:
 def _judged(explanation: Explanation) -> Sequence[str]:
     own = explanation.evidence
     return (
-        f"The search is evaluated on {own.text}, in free runs of {own.length:.3g} s. Similar recordings are held out "
-        "together.",
+        f"The search is evaluated on {own.text}, in free runs of {own.length:.3g} s, and in short ones of "
+        f"{own.short:.2g} s. Similar recordings are held out together.",
         f"The search chose from {explanation.candidates} candidates. Each step scores all candidates by one "
         "Gauss-Newton step. The best candidates are fitted in every fold, with all parameters and initial states.",
         f"A term is added if its ratio to the previous step is below {ADDED:g} and the upper bound of its interval is "
         f"below 1. The ratio is the {explanation.averaged}. The true ratio exceeds one bound of the interval with a "
         f"probability of {DOUBT:.0%}, for all fitted candidates of the step together. For the upper bound, a "
         f"reduction by more than {1 - GAIN:.0%} counts as {1 - GAIN:.0%}.",
+        f"If the runs do not suffice, but their ratio is below {WORTH:g}, short runs may show the same. Of candidates "
+        f"whose errors differ by less than a factor of {1 / ADDED:.2f}, the one with the fewest parameters is added.",
         "A term is not added if its parameters are not identifiable or end at a bound, or if the error with the term "
         f"stays above {POOR:g} and the ratio above {GAIN:g}.",
-        *([ALONE] if own.recordings == 1 else []),
+        *([FEW] if own.recordings < FEWEST else []),
         "Errors are root mean squares over all held-out samples, divided by the outputs' spreads.",
     )
 

@@ -21,7 +21,7 @@ from hybrid_mpc import (
 )
 from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.identify import term_table
-from hybrid_mpc.identify.explain import _Explain, _Fitted, explain
+from hybrid_mpc.identify.explain import _Explain, _Fitted, _HeldOut, explain
 from hybrid_mpc.identify.explanation import Evidence, Explanation, HeldOutError, Trial
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import Simulation, visited
@@ -29,7 +29,7 @@ from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.machine import terms
 from hybrid_mpc.machine.terms import At, Term, extended
 from hybrid_mpc.records import plain, record
-from hybrid_mpc.workflow.explain_page import ALONE, steps_table
+from hybrid_mpc.workflow.explain_page import FEW, steps_table
 from hybrid_mpc.workflow.explained import ExplainResult
 
 DT = 0.02
@@ -243,11 +243,11 @@ def test_a_candidate_whose_fit_diverges_is_reported_and_the_search_goes_on():
 
 @pytest.mark.parametrize("failure", [InputError("too stiff"), np.linalg.LinAlgError("singular")])
 def test_a_pair_is_needed_where_the_model_without_a_term_cannot_be_simulated(failure):
-    def fail(terms, theta):
+    def fail(evidence, terms, theta):
         raise failure
 
     search = SimpleNamespace(without=lambda terms, theta, form: (terms, theta), held_out=fail)
-    own = SimpleNamespace(search=search, now=SimpleNamespace(terms=()))
+    own = SimpleNamespace(search=search, now=SimpleNamespace(terms=()), evidence=None)
     pair = SimpleNamespace(sure=True, forms=("one", "other"), theta=np.zeros(2))
     assert _Explain._both_needed(own, pair)
 
@@ -386,23 +386,57 @@ def test_products_need_several_recordings():
     made = terms.product("phi_dot", Parameter("k", 0.0, "1/s^2", -1.0, 1.0), one="phi", two="phi")
     pool = dry, Candidate("product", (made,))
     assert [
-        begun(runs=recorded(Pendulum(), n, 20.0), candidates=pool, most=0).candidates for n in (1, 2)
+        begun(runs=recorded(Pendulum(), n, 20.0), candidates=pool, most=0).candidates for n in (2, 3)
     ] == [1, 2]
 
 
 @pytest.mark.parametrize(
-    ("recordings", "ratio", "added"), [(1, 0.8, 0), (1, 0.6, 1), (5, 0.8, 1), (5, 0.9, 0)]
+    ("recordings", "ratio", "added"), [(1, 0.8, 0), (2, 0.8, 0), (2, 0.6, 1), (3, 0.8, 1), (5, 0.9, 0)]
 )
-def test_a_single_recording_must_show_more(recordings, ratio, added):
+def test_a_few_recordings_must_show_more(recordings, ratio, added):
     summary = SimpleNamespace(recordings=recordings)
     found = HeldOutError(error=0.1, ratio=ratio, lower=0.5, upper=0.95, harm=0.0)
+    doubt = _HeldOut.doubt(
+        SimpleNamespace(summary=summary), found, 0.5 * np.ones((2, 3)), np.ones((2, 3)), 10
+    )
+    assert (not doubt) == bool(added)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "short", "added"), [(0.9, "", 1), (0.9, "not significant", 0), (0.97, "", 0)]
+)
+def test_short_runs_may_show_what_long_ones_do_not(ratio, short, added):
+    long, brief = (HeldOutError(0.1, r, 0.7, 1.1, 0.2) for r in (ratio, 0.8))
+    evidence = SimpleNamespace(compared=lambda *squares: long, doubt=lambda *squares: "not significant")
     search = SimpleNamespace(
-        evidence=SimpleNamespace(summary=summary, compared=lambda *squares: found),
-        now=SimpleNamespace(squares=np.ones((2, 3)), terms=()),
+        evidence=evidence,
+        short=SimpleNamespace(compared=lambda *squares: brief, doubt=lambda *squares: short),
+        now=SimpleNamespace(squares=np.ones((2, 3)), terms=(), theta=np.zeros(1)),
+        _short=lambda forms, theta: np.ones((2, 3)),
         _at_bounds=lambda forms, theta: [],
     )
     judged = _Explain._judged(search, (), np.zeros(1), 0.5 * np.ones((2, 3)), 10, [])
     assert judged.sure == bool(added)
+    assert judged.short == (None if ratio > 0.95 else brief)
+
+
+@pytest.mark.parametrize(("worse", "simple"), [(1.1, True), (1.3, False)])
+def test_a_further_parameter_must_gain_as_much_as_a_further_term(worse, simple):
+    level = Parameter("F", 0.0, "N m", 0.0, 1.0)
+    dry = terms.coulomb("phi_dot", level, width=0.05)
+    other = terms.coulomb_by_position(
+        "phi_dot",
+        *(Parameter(name, 0.0, "N m", -1.0, 1.0) for name in ("F_1", "F_2")),
+        width=0.05,
+        turning=True,
+    )
+    error = HeldOutError(0.1, 0.5, 0.4, 0.6, 0.0)
+    near, best = (
+        _Fitted((form,), replace(error, ratio=r), np.zeros(1), np.array([r]), sure=True)
+        for form, r in ((dry, worse * 0.5), (other, 0.5))
+    )
+    evidence = SimpleNamespace(compared=lambda own, than, n: replace(error, ratio=float(own[0] / than[0])))
+    assert _Explain._chosen(SimpleNamespace(evidence=evidence), [near, best]) is (near if simple else best)
 
 
 @pytest.mark.parametrize(
@@ -425,15 +459,15 @@ def test_the_outcome_does_not_contradict_the_ratio(ratio, outcome, words):
     assert Trial((), "worse", None).outcome_words == "no gain"
 
 
-def test_the_rule_for_a_single_recording_stands_where_it_applies():
-    for count in (1, 5):
+def test_the_rule_for_few_recordings_stands_where_it_applies():
+    for count in (1, 2, 5):
         own = Explanation(
             "Prior", 1.0, 0.1, HeldOutError(0.1, 1.0, 1.0, 1.0, 1.0), (), (), (),
             Evidence(count, 8, 5, 1.0, f"{count} recordings"), 30, "no gain",
         )  # fmt: skip
-        assert (ALONE in steps_table(own).caption) == (count == 1)
+        assert (FEW in steps_table(own).caption) == (count < 3)
         lines = summary(ExplainResult("tank", own, 0.0, 0.01), Path("out"))
-        assert (ALONE in lines) == (count == 1)
+        assert (FEW in lines) == (count < 3)
         assert "no scenario file was written" in lines[-1]
 
 

@@ -306,16 +306,19 @@ def test_a_folder_of_another_benchmark_is_refused(call, machine, made):
     assert "HM-WORKFLOW-013" in told
 
 
-def test_a_scheduler_s_workers_train_the_networks(machine, tmp_path, monkeypatch):
+def test_a_scheduler_s_workers_examine_the_fit_and_train_the_networks(machine, tmp_path, monkeypatch):
     """The jobs go to the engine with the scheduler's address; tests of the engine say what it does with them."""
     scenario, train, test = machine
     asked = []
 
     def engine(jobs, on_progress, workers, *, cluster):
         asked.append((sorted(jobs), cluster))
-        raise InputError("no worker")
+        if "pgrnn" in jobs:
+            raise InputError("no worker")
+        return {"wrong terms": "", "recordings": ()}
 
     monkeypatch.setattr("hybrid_mpc.workflow.stages.identify.run_jobs", engine)
     with pytest.raises(InputError, match="no worker"):
         benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), tmp_path, cluster="tcp://127.0.0.1:9")
-    assert asked == [(["mopgrnn", "pgrnn", "rnn"], "tcp://127.0.0.1:9")]
+    address = "tcp://127.0.0.1:9"
+    assert asked == [(["recordings", "wrong terms"], address), (["mopgrnn", "pgrnn", "rnn"], address)]

@@ -25,7 +25,7 @@ class Heater(hm.Prior):
         return ((p.gain * u.power - x.heat) / p.tau,)
 
 
-SCENARIO = hm.Scenario(
+scenario = hm.Scenario(
     "heater", "", "", prior=Heater, sensor_sigma=(0.01,),
     control=hm.OCP(20, [0.0], [0.1], [0.1], [-5.0], [5.0], q_y=[1.0]),
     data=hm.DataSpec("t", ("power",), ("heat",), dt=DT, max_gap=DT, smoothing=DT, warm_up=2.0, free_run=4.0),
@@ -53,7 +53,7 @@ def files(tmp_path_factory):
 
 
 def context_of(files, out, track):
-    context = Context(RunSettings("heater", files, track=track), SCENARIO, out)
+    context = Context(RunSettings(__file__, files, track=track), scenario, out)
     for stage in (DATA, PRIOR, TRACK):
         bring_up_to_date(context, stage)
     return context

@@ -338,10 +338,18 @@ def examined_prior(context: Context) -> PriorResult:
         *warn_of_stability(make, fit, every[: len(train)], spec.dt),
     )
     length = longest_run or longest or trial
-    context.progress.update("free runs", 1, 1, "fitting each recording alone")
     known_late = spec.largest_delay > 0 or any("HM-IDENTIFY-080" in one for one in fit.warnings)
-    alone = fit_each(make, fit, [*train, *valid], dt=spec.dt, length=length, delay=not known_late)
-    differ = () if alone is None else alone.warnings
+    common = context.scenario_path, fit, spec.dt, length
+    looked = run_jobs(
+        {
+            "wrong terms": (_wrong_terms, (*common, shifted(train, fit.delay), context.time_unit)),
+            "recordings": (_each_recording, (*common, [*train, *valid], not known_late)),
+        },
+        lambda name, done, total, text: context.progress.update("free runs", 1, 1, text),
+        context.workers,
+        cluster=context.cluster,
+    )
+    wrong, differ = looked["wrong terms"], looked["recordings"]
     for warning in (*worse, *differ):
         context.progress.warn(f"fit of the prior: {warning}")
     fit = replace(fit, warnings=(*fit.warnings, *growth, *worse, *differ))
@@ -354,14 +362,7 @@ def examined_prior(context: Context) -> PriorResult:
     # predict the outputs from the inputs and look better than they are
     compared = baselines if not growth else {"constant": baselines["constant"]}
     simpler = {name: one.errors.error for name, one in compared.items() if one.errors is not None}
-    acting, unit = shifted(train, fit.delay), context.time_unit
     off = zip(errors["phy"].rmse.items(), smoother.sizes.y, strict=True)
-
-    def searching(text: str) -> None:
-        context.progress.update("free runs", 1, 1, f"looking for wrong terms: {text}")
-
-    searching("smoothing the recordings")
-    wrong = named(causes(make, fit.values, acting, spec.dt, length, unit, searching))
     lacks = [bounds_doubt(bounds, len(fit.standard_errors))]
     # where small errors grow, errors of initial states grow too: then the windows of the fit, with free initial states,
     # test the equations
@@ -376,7 +377,7 @@ def examined_prior(context: Context) -> PriorResult:
     in_doubt = (*([wrong] if wrong else []), *lacking)
     for doubt in in_doubt:
         context.progress.warn(f"{IN_DOUBT}: {doubt}")
-    one_step = smoother.prediction_errors(acting)
+    one_step = smoother.prediction_errors(shifted(train, fit.delay))
     return PriorResult(
         fit=fit,
         nominal=make().values,
@@ -393,6 +394,29 @@ def examined_prior(context: Context) -> PriorResult:
         arrays={f"{t.name}/{key}": getattr(t, key) for t in every for key in ("x", "xdot")},
         lacking=lacking,
     )
+
+
+def _wrong_terms(
+    scenario: str, fit: PriorFit, dt: float, length: float, acting: Sequence[Trajectory], unit: float,
+    report: Callable[[int, int, str], None],
+) -> str:  # fmt: skip
+    """Job of one process: the mistakes in the prior that explain its errors, in words."""
+
+    def searching(text: str) -> None:
+        report(0, 1, f"looking for wrong terms: {text}")
+
+    searching("smoothing the recordings")
+    return named(causes(load_scenario(scenario).prior, fit.values, acting, dt, length, unit, searching))
+
+
+def _each_recording(
+    scenario: str, fit: PriorFit, dt: float, length: float, recordings: Sequence[Trajectory], delay: bool,
+    report: Callable[[int, int, str], None],
+) -> tuple[str, ...]:  # fmt: skip
+    """Job of one process: warnings of fits of each recording alone."""
+    report(0, 1, "fitting each recording alone")
+    alone = fit_each(load_scenario(scenario).prior, fit, recordings, dt=dt, length=length, delay=delay)
+    return () if alone is None else alone.warnings
 
 
 def _error_of(baseline: BaselineScores) -> float:
