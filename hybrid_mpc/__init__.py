@@ -100,6 +100,7 @@ if TYPE_CHECKING:  # the table below once more, for type checkers; "as" says tha
     from hybrid_mpc.identify.varying import find_varying as find_varying
     from hybrid_mpc.identify.windows import FirstStates as FirstStates
     from hybrid_mpc.check.preflight import check_scenario as check_scenario
+    from hybrid_mpc.check.with_terms import with_terms as with_terms
     from hybrid_mpc.workflow.check_fit import check_fit as check_fit
     from hybrid_mpc.workflow.explain import explain as explain
     from hybrid_mpc.compare.controllers import find_noise as find_noise
@@ -181,6 +182,7 @@ _ROOMS = {
     ),
     "analyze.sensitivity": ("parameter_sensitivities",),
     "check.preflight": ("check_scenario",),
+    "check.with_terms": ("with_terms",),
     "compare.controllers": ("find_noise",),
     "compare.loops": ("Bench", "LoopRow", "LoopSpec", "varied"),
     "compare.sequential": ("Comparison", "compare_costs"),

@@ -258,6 +258,38 @@ class OCP:
             fields = {**dict.fromkeys(free), **fields}
         return replace(self, **fields)
 
+    def with_states(self, at_rest: ArrayLike) -> OCP:
+        """The same problem for a model with further states behind the present ones, without weights and bounds.
+
+        ``at_rest`` ``(k,)`` are their values at the working point.
+
+        Example:
+            >>> heater = OCP(20, (1.0, 0.1), (0.1,), (0.0,), u_min=(0.0,), u_max=(5.0,), x_max=(90.0, 90.0))
+            >>> slower = heater.with_states([2.0])
+            >>> slower.q, slower.x_max
+            (array([1. , 0.1, 0. ]), array([90., 90., inf]))
+        """
+        rest = np.asarray(at_rest, dtype=np.float64)
+        k, n_x = rest.size, self.n_x
+        # a state without weight needs penalties of its bounds, which are infinite
+        sizes = {"q": 0.0, "x_min": -np.inf, "x_max": np.inf, "slack_linear": 0.0, "slack_quadratic": 1.0}
+        fields: dict[str, Any] = {
+            name: np.append(value, np.full(k, more))
+            for name, more in sizes.items()
+            if (value := getattr(self, name)) is not None
+        }
+        if not isinstance(self.terminal, str):
+            fields["terminal"] = np.pad(self.terminal, (0, k))
+        if self.working_point is not None:
+            fields["working_point"] = np.append(self.working_point[0], rest), self.working_point[1]
+        fields["economic"] = self.economic and _of_first_states(self.economic, n_x, k)
+        fields["soft"] = [
+            SoftBound(_of_first_states(b.expression, n_x, k), b.lower, b.upper, b.linear, b.quadratic)
+            for b in self.soft
+        ]
+        fields["hard"] = [_with_free_states(b, n_x, k) for b in self.hard]
+        return self.changed(**fields)
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, OCP):
             return NotImplemented
@@ -432,6 +464,27 @@ class OCP:
             c = output_with_jacobian(model)(x, u, model.w)[1].full()
             q[: self.n_x, : self.n_x] += (c.T * self.q_y) @ c * model.dt
         return a, b, q, np.diag(self.r + self.r_delta) * model.dt
+
+
+def _of_first_states(f: ca.Function, n_x: int, more: int) -> ca.Function:
+    """An expression of ``(x, u, ...)`` for states that have ``more`` further ones behind."""
+    x = ca.SX.sym("x", n_x + more)
+    others = [ca.SX.sym(f.name_in(i), f.sparsity_in(i)) for i in range(1, f.n_in())]
+    return ca.Function(f.name(), [x, *others], [f(x[:n_x], *others)])
+
+
+def _with_free_states(bound: HardBound, n_x: int, more: int) -> HardBound:
+    """A hard bound that leaves ``more`` further states free."""
+    if isinstance(bound.what, ca.Function):
+        what = _of_first_states(bound.what, n_x, more)
+        return HardBound(what, bound.lower, bound.upper, bound.priority, bound.at_end)
+    if bound.what == "y":
+        return bound
+    lower, upper = (
+        np.append(bound.lower, np.full(more, -np.inf)),
+        np.append(bound.upper, np.full(more, np.inf)),
+    )
+    return HardBound("x", lower, upper, bound.priority, bound.at_end)
 
 
 def _bounds(given: object, kind: type[Bound], name: str) -> tuple[Bound, ...]:

@@ -275,7 +275,7 @@ class _Library:
                 f"tau_s{number}_{state.name}", max(share * self.length, 2 * self.dt), "s", self.dt, self.length,
                 "time constant of the second capacity",
             )  # fmt: skip
-            inner = Signal(f"{state.name}_{number}", state.unit, state.lower, state.upper)
+            inner = _ranged(state, self.x[:, i], f"{state.name}_{number}")
             forms.append(laws.storage(state.name, k, tau, state=inner))
         return Candidate(f"second capacity of {state.name}", tuple(forms))
 
@@ -290,7 +290,7 @@ class _Library:
             return
         gain = Parameter(f"g_{own}", 0.0, "-", -2.0, 2.0, "relative error of the disturbance's gain")
         yield laws.disturbance_gain(own, gain, centre=centre)
-        acting = replace(signal, name=f"{own}_acting", saturation=None)
+        acting = _ranged(signal, values, f"{own}_acting")
         yield laws.disturbance_lag(own, self._time(f"tau_{own}", "lag of the disturbance"), state=acting)
 
     def _time(self, name: str, words: str) -> Parameter:
@@ -320,9 +320,9 @@ class _Library:
             return Parameter(f"{key}_{own}", 0.0, unit, 0.0 if positive else -most, most, words)
 
         tau = self._time(f"tau_{own}", "lag of the input")
-        yield laws.input_lag(own, tau, state=replace(signal, name=f"{own}_acting"))
+        yield laws.input_lag(own, tau, state=_ranged(signal, values, f"{own}_acting"))
         late = self._time(f"late_{own}", "delay of the input")
-        yield laws.input_delay(own, late, state=replace(signal, name=f"{own}_late"))
+        yield laws.input_delay(own, late, state=_ranged(signal, values, f"{own}_late"))
         yield laws.input_gain(own, of("g", 0.9, words="relative error of the gain"))
         yield laws.input_offset(own, of("o", 2 * spread, signal.unit, "offset of the input"))
         if (values < 0).any() and (values > 0).any():
@@ -356,8 +356,7 @@ class _Library:
             return Parameter(f"{key}_{own}", 0.0, own_unit, -most, most, words)
 
         tau = self._time(f"tau_{own}", "lag of the sensor")
-        shown = Signal(f"{own}_shown", unit, signal.lower, signal.upper)
-        yield laws.output_lag(own, tau, state=shown)
+        yield laws.output_lag(own, tau, state=_ranged(signal, y, f"{own}_shown"))
         yield laws.output_gain(own, of("s_g", 0.5, words="relative error of the sensor's gain"))
         yield laws.output_offset(own, of("s_o", 2 * spread, unit, "offset of the sensor"))
         low, high = (float(v) for v in np.quantile(y, (0.0, 1.0)))
@@ -367,8 +366,14 @@ class _Library:
         yield laws.output_curve(own, bend, lower=low, upper=high)
 
 
+def _ranged(signal: Signal, values: Array, name: str) -> Signal:
+    """State of a term that follows a signal: an estimator needs its range."""
+    low, high = _ends(signal, values)
+    return Signal(name, signal.unit, low, high)
+
+
 def _ends(signal: Signal, values: Array) -> tuple[float, float]:
-    """Range in which a curve must not reverse: the signal's bounds, else the recordings and a margin."""
+    """Range of a signal, in which a curve must not reverse: its bounds, else the recordings and a margin."""
     low, high = float(values.min()), float(values.max())
     # how far beyond the recordings no curve of a signal without bounds may reverse, over the range of the recordings
     more = 0.5 * (high - low)

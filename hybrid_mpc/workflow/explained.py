@@ -90,10 +90,9 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Pa
         *(["OperatingPoint"] if point else []),
         "Parameter",
         *(["Signal"] if signals else []),
-        "extended",
         "load_scenario",
         "terms",
-        "with_nominal",
+        "with_terms",
     ]
     found_from = (
         f"str(Path(__file__).parent / {_way(folder, where)!r})" if where.endswith(".py") else repr(where)
@@ -106,9 +105,7 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Pa
         "You may edit this file.",
         '"""',
         "",
-        "from dataclasses import replace",
-        *(["from pathlib import Path"] if where.endswith(".py") else []),
-        "",
+        *(["from pathlib import Path", ""] if where.endswith(".py") else []),
         f"from hybrid_mpc import {', '.join(names)}",
         "",
         f"machine = load_scenario({found_from})",
@@ -131,17 +128,9 @@ def scenario_code(scenario: Scenario, where: str, found: Explanation, folder: Pa
             f"POINT = OperatingPoint(x={point.x!r}, u={point.u!r}, w={point.w!r})",
             '"""Equilibrium with the found terms and the fitted values."""', "",
         ] if point else []),
-        "scenario = replace(", "    machine,", f"    name={explained_name(scenario.name)!r},",
-        f"    title={scenario.title + ', with found terms'!r},",
-        f"    prior=with_nominal(extended(type(machine.prior()), *TERMS), FITTED{', POINT' if point else ''}),",
-        "    explained=True,",
+        "scenario = with_terms(", "    machine,", "    TERMS,", "    FITTED,", *(["    POINT,"] if point else []),
+        f"    name={explained_name(scenario.name)!r},", f"    title={scenario.title + ', with found terms'!r},",
     ]  # fmt: skip
-    if scenario.control is not None and any(state_of(term) for term in found.found):
-        lines += [
-            "    # A found term has a state: add its weight to the control problem and its initial value to the tasks,",
-            "    # then remove these lines.",
-            "    control=None,", "    tasks=(),", "    plant=None,", "    oracle=None,",
-        ]  # fmt: skip
     return "\n".join([*lines, ")", ""])
 
 

@@ -242,10 +242,12 @@ def test_a_prior_with_terms_can_be_explained_again(explained, machine, files, tm
         hm.explain(RunSettings(str(out / found.file), files), tmp_path / "again", terms=("coulomb",))
 
 
-def test_a_found_state_leaves_the_control_problem_to_the_user(machine, explained, tmp_path):
+def test_a_found_state_is_added_to_the_control_problem_and_the_tasks(machine, explained, tmp_path):
     _, found = explained
     told, base = found.explanation, load_scenario(str(machine / "my_machine.py"))
-    lag = terms.input_lag("tau", hm.Parameter("t_tau", 0.1, "s", 0.01, 1.0), state=hm.Signal("s_tau", "N m"))
+    lag = terms.input_lag(
+        "tau", hm.Parameter("t_tau", 0.1, "s", 0.01, 1.0), state=hm.Signal("s_tau", "N m", -9.0, 9.0)
+    )
     term = replace(told.found[0], name=lag.name, made=lag.made)
     value = replace(told.parameters[-1], name="t_tau", value=0.2, lower=0.01, upper=1.0)
     changed = replace(
@@ -255,7 +257,8 @@ def test_a_found_state_leaves_the_control_problem_to_the_user(machine, explained
     file.write_text(scenario_code(base, str(machine / "my_machine.py"), changed, tmp_path))
     assert str(machine) not in file.read_text()  # the way to it, so that both may move
     scenario = load_scenario(str(file))
-    assert scenario.control is None
+    assert scenario.control.q.size == base.control.q.size + 1
+    assert scenario.plant is None
     assert [s.name for s in scenario.prior().states][-1] == "s_tau"
     assert scenario.prior().values["t_tau"] == 0.2
     check_scenario(scenario)
