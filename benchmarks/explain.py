@@ -97,8 +97,9 @@ def row(
             fit = record(PriorFit, read_json(path), "the fit")
         else:
             fit = fit_prior(
-                make, train, valid, dt=dt, length=length, largest_delay=spec.largest_delay, time_unit=unit
-            )
+                make, train, valid, dt=dt, length=length, largest_delay=spec.largest_delay, time_unit=unit,
+                warm_up=spec.warm_up,
+            )  # fmt: skip
             write_json(path, plain(fit))
         fitted = make(fit.values)
         held = shifted(test, fit.delay)

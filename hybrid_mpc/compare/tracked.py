@@ -93,6 +93,7 @@ def find_tracked(
                 dt=spec.dt,
                 length=length,
                 largest_delay=spec.largest_delay,
+                warm_up=spec.warm_up,
                 start=fit.values,
             )
             held.append((observer_of(scenario, own, kept[0]), [t for t in recordings if t.file in out]))

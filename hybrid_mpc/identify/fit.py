@@ -23,7 +23,7 @@ from hybrid_mpc.identify.delay import shifted
 from hybrid_mpc.identify.fit_warnings import late_inputs, warnings_of
 from hybrid_mpc.identify.identifiable import Fitted, correlations, standard_errors
 from hybrid_mpc.identify.output_fit import GROWN, OutputFit
-from hybrid_mpc.identify.prior_result import ENOUGH, PREDICTIONS, PriorFit, winner
+from hybrid_mpc.identify.prior_result import ENOUGH, FROM_WARM_UP, PREDICTIONS, PriorFit, winner
 from hybrid_mpc.identify.shooting import Shooting
 from hybrid_mpc.identify.simulation import (
     MAX_SUBSTEPS,
@@ -35,6 +35,7 @@ from hybrid_mpc.identify.simulation import (
 )
 from hybrid_mpc.identify.smooth import Smoother, fit_smoother, rough_smoother, unseen_states
 from hybrid_mpc.identify.starts import further_starts, promising, promising_starts
+from hybrid_mpc.identify.warm_up import refitted
 from hybrid_mpc.identify.windows import (
     FEW,
     FREE,
@@ -72,6 +73,7 @@ def fit_prior(
     start: Mapping[str, float] | None = None,
     time_unit: float | None = None,
     first_states: FirstStates = FREE,
+    warm_up: float = 0.0,
     on_progress: Progress = lambda done, total, text: None,
 ) -> PriorFit:
     """Fit parameters and delay to the measured outputs over windows of increasing length, and fit the smoother.
@@ -83,8 +85,10 @@ def fit_prior(
     3. **Selection.** Of the nominal values and all lengths, the result with the least error over the longest windows is
        used, on training and validation recordings together. (A few parameters hardly overfit, and on a drifting machine
        a short validation part alone would mislead.)
-    4. **Regularization.** A weak pull towards the nominal values keeps parameters that are not identifiable there.
-    5. **Integration.** At the end, integration steps are halved until this no longer changes a parameter significantly.
+    4. **Warm-up.** If free runs from a ``warm_up`` have more than twice that error, the parameters are fitted to such
+       runs; the result is used if it halves their error (:mod:`~hybrid_mpc.identify.warm_up`).
+    5. **Regularization.** A weak pull towards the nominal values keeps parameters that are not identifiable there.
+    6. **Integration.** At the end, integration steps are halved until this no longer changes a parameter significantly.
 
     The order of the recordings does not matter, and recordings that follow each other within a period are joined
     (:func:`continued`). A prior without free parameters stays unchanged.
@@ -104,6 +108,8 @@ def fit_prior(
             Default: none.
         time_unit: The machine's time unit [s]. Default: that of the training trajectories.
         first_states: Knowledge about the initial states of free runs. Default: none, all are free.
+        warm_up: Length [s] of the past from which the evaluation determines the initial state of a free run. Default 0:
+            no runs from a warm-up.
         on_progress: ``(done, total, text)`` after every stage.
 
     Raises:
@@ -245,6 +251,15 @@ def fit_prior(
         if winner([name for name, _ in candidates], scores) == len(scores) - 1:
             chosen = candidates[-1][1]
             smoother = smoother_of(chosen)
+    if fit.free and first_states.kind == "free":
+        from_past = refitted(
+            fit, chosen, [one.theta for _, one in candidates],
+            shifted([*train, *valid], fit.delay(chosen.theta)), min(scores), warm=round(warm_up / dt), periods=periods, smoother_of=smoother_of,
+        )  # fmt: skip
+        if from_past is not None:
+            chosen, smoother = from_past
+            candidates.append((FROM_WARM_UP, chosen))
+            scores += _errors_of([chosen.theta], scoring)
     stages = tuple({"stage": c[0], "validation_error": s} for c, s in zip(candidates, scores, strict=True))
     warnings = warnings_of(fit, chosen, answered, min(scores) / max(scores[0], 1e-300))
     lacking, late = 0.0, tuple[str, ...]()

@@ -20,6 +20,8 @@ CORRELATED = 0.99
 """Correlation of the errors of two parameters above which the two are reported."""
 ENOUGH = 1.01
 """Ratio to the least error up to which the longest windows are used: long windows identify the parameters best."""
+FROM_WARM_UP = "free runs from the warm-up"
+"""Name of the stage that is fitted to free runs from a warm-up."""
 PREDICTIONS = "predictions"
 """Name of the stage that is fitted by predictions one period ahead instead of free runs."""
 LEAST_T = 2.0
@@ -29,12 +31,15 @@ LEAST_T = 2.0
 def winner(stages: Sequence[str], errors: Sequence[float]) -> int:
     """Index of the stage to use: the last stage (longest windows) whose error is within 1 % of the least error.
 
-    The stage ``PREDICTIONS`` is used only if its error is more than 1 % below that of all others.
+    The stage ``PREDICTIONS`` is used only if its error is more than 1 % below that of all others; the stage
+    ``FROM_WARM_UP`` is always used, because a fit only has it if it predicts better.
 
     Example:
         >>> winner(["nominal", "short", "long", "longer"], [0.5, 0.1, 0.1005, 0.2])
         2
     """
+    if FROM_WARM_UP in stages:
+        return stages.index(FROM_WARM_UP)
     runs = [i for i, stage in enumerate(stages) if stage != PREDICTIONS]
     least = min(errors[i] for i in runs)
     found = max(i for i in runs if errors[i] <= ENOUGH * least)

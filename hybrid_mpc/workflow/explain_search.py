@@ -175,6 +175,7 @@ class Search:
         fit = fit_prior(
             self.make, self.train, self.valid, dt=self.dt, length=self.longest,
             largest_delay=self.context.spec.largest_delay, time_unit=time_unit(self.train, self.dt),
+            warm_up=self.context.spec.warm_up,
             on_progress=self._progress("free runs"),
         )  # fmt: skip
         self._keep("fit", fit)

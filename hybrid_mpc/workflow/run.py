@@ -102,15 +102,20 @@ def run(
         known(settings.deploy, [name for name in CANDIDATES if name in there], "model to deploy")
     end = _end(context, only)
     took: dict[str, float] = {}
-    without = (
-        "on_model" if scenario.plant is not None else "control",
-        *(name for name, wanted in (("explain", settings.explain), ("track", settings.track)) if not wanted),
-    )
     with open_folder(out, run_note(settings), resume=resume):
         for i, stage in enumerate(STAGES):
             if stage is end:
                 report_so_far(context)
                 return None
+            without = (
+                # stage explain leaves out the plant if a found term has a state
+                "on_model" if context.scenario.plant is not None else "control",
+                *(
+                    name
+                    for name, wanted in (("explain", settings.explain), ("track", settings.track))
+                    if not wanted
+                ),
+            )
             ahead = [
                 s.name for s in STAGES[i:] if s.name not in (*skip, *without) and (not only or s.name in only)
             ]

@@ -301,7 +301,7 @@ def examined_prior(context: Context) -> PriorResult:
     try:
         fit = fit_prior(
             make, train, valid, dt=spec.dt, length=longest, largest_delay=spec.largest_delay,
-            time_unit=context.time_unit,
+            time_unit=context.time_unit, warm_up=spec.warm_up,
             on_progress=lambda done, total, text: context.progress.update("free runs", done, total, text),
         )  # fmt: skip
     except InputError as error:
