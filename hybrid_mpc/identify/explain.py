@@ -106,8 +106,8 @@ LEAST = 20
 """Minimum periods of a part of a single recording."""
 ALONG = 4
 """Integration steps of a period for a term's state along a recording."""
-FEW = 6
-"""Iterations over the long windows that score a lag."""
+FEW, EVERY = 6, 3
+"""Iterations over the long windows that score a lag, and the share of the windows that do, one of so many."""
 LOWERED = 0.99
 """Ratio of errors over all windows that a candidate must fall below before it is fitted in every fold."""
 MEMORY = 3.0
@@ -386,22 +386,20 @@ class _Search:
         """``theta`` of all terms from that of the first ones; the others start at their nominal values."""
         return np.concatenate([theta, self.fit(terms).nominal[len(theta) :]])
 
-    def by_short_windows(self, terms: Terms, start: Array) -> Array:
-        """Fit to the short windows."""
-        return self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
-
-    def slow_score(self, terms: Terms, theta: Array, ends: float) -> float:
+    def slow_score(self, now: Terms, terms: Terms, theta: Array) -> float:
         """Logarithm of the ratio of errors with a lag: derivatives at its nominal value do not predict its effect.
 
-        The better of a fit to the short windows, and a few iterations over the long ones: in short windows the initial
-        states explain a part of a lag.
+        The better of a fit to short windows, and a few iterations over long ones: in short windows the initial states
+        explain a part of a lag.
         """
         start = self.start(terms, theta)
+        long, short = (np.arange(len(by.starts)) % EVERY == 0 for by in (self.evidence, self.short))
         fits = [
-            self.by_short_windows(terms, start),
-            self.problem(terms, self.evidence.windows).solve(start, FEW).theta,
+            self.problem(terms, self.short.rows(short)).solve(start, ITERATIONS).theta,
+            self.problem(terms, self.evidence.rows(long)).solve(start, FEW).theta,
         ]
-        return 0.5 * math.log(min(self.error(terms, one) for one in fits) / ends)
+        ends = self.error(now, theta, long)
+        return 0.5 * math.log(min(self.error(terms, one, long) for one in fits) / ends)
 
     def begun(self, terms: Terms, theta: Array) -> Fitted:
         """Fit to all windows, from ``theta`` of the terms without the last ones.
@@ -411,7 +409,7 @@ class _Search:
         """
         start = self.start(terms, theta)
         problem = self.problem(terms, self.evidence.windows)
-        near = self.by_short_windows(terms, start)
+        near = self.problem(terms, self.short.windows).solve(start, ITERATIONS).theta
         starts = (
             [start, near] if problem.explained([near])[0] < FAR * problem.explained([start])[0] else [start]
         )
@@ -432,10 +430,11 @@ class _Search:
                 found.append(term)
         return found
 
-    def error(self, terms: Terms, theta: Array) -> float:
-        """Mean squared error over all windows."""
-        squares = _squares(self.judged(self.evidence, terms, theta), theta)
-        return max(float(squares[self.evidence.counted].mean()), 1e-300)
+    def error(self, terms: Terms, theta: Array, keep: NDArray[np.bool_] | None = None) -> float:
+        """Mean squared error over all windows, or over those of a mask."""
+        squares = _squares(self.judged(self.evidence, terms, theta, keep), theta)
+        counted_ = self.evidence.counted if keep is None else self.evidence.counted[keep]
+        return max(float(squares[counted_].mean()), 1e-300)
 
     def without(self, terms: Terms, theta: Array, dropped: Term) -> tuple[Terms, Array]:
         """The terms without one, and the remaining ``theta``."""
@@ -729,7 +728,6 @@ class _Explain:
                 best[k] = min(best.get(k, own), own)
             ranked += sorted(best.values())
             singles += [(score, (plain[i][1],)) for score, i in ranked]
-        ends = search.error(now.terms, now.theta)
         diverged = []
         slow = [one for one in self.pool if not _vanishes(one.forms[0])]
         # a lag acts at its nominal values, so derivatives do not predict its effect
@@ -737,7 +735,7 @@ class _Explain:
             scores = []
             for form in one.forms:
                 try:
-                    score = search.slow_score(terms=(*now.terms, form), theta=now.theta, ends=ends)
+                    score = search.slow_score(now.terms, (*now.terms, form), now.theta)
                 except (InputError, np.linalg.LinAlgError) as error:
                     diverged.append(Trial((_found(form),), "diverged", None, str(error)))
                     continue

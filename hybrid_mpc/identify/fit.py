@@ -254,7 +254,8 @@ def fit_prior(
     if fit.free and first_states.kind == "free":
         from_past = refitted(
             fit, chosen, [one.theta for _, one in candidates],
-            shifted([*train, *valid], fit.delay(chosen.theta)), min(scores), warm=round(warm_up / dt), periods=periods, smoother_of=smoother_of,
+            shifted([*train, *valid], fit.delay(chosen.theta)), min(scores),
+            warm=round(warm_up / dt), periods=periods, smoother_of=smoother_of,
         )  # fmt: skip
         if from_past is not None:
             chosen, smoother = from_past
