@@ -140,7 +140,7 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     n = len(acting.t) if length is None else max(1, round(length / dt))
     begins = range(0, len(acting.t) - warm, n)
     runs = [acting.part(slice(a, a + warm + n)) for a in begins]
-    smoother = Smoother(prior, dt, held.sigma, held.walk, held.sizes, held.fading, held.substeps)
+    smoother = Smoother(prior, dt, **held.smoother_settings)
     starts = smoother.smooth([run.part(slice(0, warm + 1)) for run in runs])
     parts = [
         _banded(kit, name, prior, run, start.x, trajectory.part(slice(a, a + lost + warm + n)))
