@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hybrid_mpc.records import BESIDE
-from hybrid_mpc.workflow import control
+from hybrid_mpc.workflow import control, predict, tune
 from hybrid_mpc.workflow.stages.results import SCHEMA_VERSION, SHOWN, Results
 
 SIMPLE = {
@@ -29,8 +29,8 @@ HEAD = f"""# `results.json`
 
 `hybrid-mpc run` writes its numbers to `results.json`: one object for each stage of the run, with the fields of the
 stage's dataclass. In Python, `read_results` (`hybrid_mpc/workflow/stages/results.py`) checks a file and returns the
-dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-mpc control` is
-[below](#hybrid-mpc-control).
+dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The files of [`hybrid-mpc control`](#hybrid-mpc-control),
+[`predict`](#hybrid-mpc-predict) and [`tune`](#hybrid-mpc-tune) are below.
 
 `python docs/site/results_schema.py > docs/results-schema.md` writes this page from the dataclasses.
 
@@ -49,11 +49,12 @@ dataclass `Results`. Schema version: **{SCHEMA_VERSION}**. The file of `hybrid-m
 - Unknown keys are refused, and files of another schema version too. `hybrid-mpc run SCENARIO --out FOLDER --resume`
   writes the file again.
 """
-CONTROL = f"""## `hybrid-mpc control`
-
-The `results.json` of [`hybrid-mpc control`](control.md) is the dataclass `ControlResults`. In Python, `read_control`
-(`hybrid_mpc/workflow/control.py`) reads it. Schema version: **{control.SCHEMA_VERSION}**.
-"""
+COMMANDS = (
+    ("control", "results.json", control, control.ControlResults, "read_control"),
+    ("predict", "predict.json", predict, predict.PredictResults, "read_predictions"),
+    ("tune", "results.json", tune, tune.TuneResults, "read_tuning"),
+)
+"""Commands with a file of their own: name, file, module, dataclass, and the function that reads it."""
 VERSIONS = """## Versions
 
 | version | differs from the one before |
@@ -160,8 +161,17 @@ def page() -> str:
     for name, kind in stages.items():
         lines += [f"## `{name}`", "", summary(kind), "", *table(kind, fields_of(kind)), ""]
         ahead += parts(kind)
-    lines += [CONTROL, *table(control.ControlResults, fields_of(control.ControlResults)), ""]
-    ahead += parts(control.ControlResults)
+    for name, file, module, kind, reader in COMMANDS:
+        lines += [
+            f"## `hybrid-mpc {name}`",
+            "",
+            f"The `{file}` of [`hybrid-mpc {name}`]({name}.md) is the dataclass `{kind.__name__}`. In Python,",
+            f"`{reader}` (`hybrid_mpc/workflow/{name}.py`) reads it. Schema version: **{module.SCHEMA_VERSION}**.",
+            "",
+            *table(kind, fields_of(kind)),
+            "",
+        ]
+        ahead += parts(kind)
     lines += ["## Objects in them", ""]
     seen: set[Any] = set()
     while ahead:

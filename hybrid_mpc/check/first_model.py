@@ -16,35 +16,36 @@ from hybrid_mpc.identify.closed_loop import feedback
 
 Array = NDArray[np.float64]
 FEWEST = 20
-"""Fewest rows of a usable recording."""
+"""Fewest samples of a usable recording."""
 MOST, JUDGED = 4000, 20_000
 """Most samples to which a lag is fitted, and on which it is evaluated."""
 MATTERS = 0.1
-"""Least share of an output's variance that its lag explains, for its time constant to matter."""
+"""Share of an output's variance that its lag must explain, so that its time constant counts."""
 STRIDES = (1, 4, 16)
-"""Distances [samples] of the predictions from which a growth rate is estimated."""
+"""Numbers of samples ahead of the predictions from which a growth rate is estimated."""
 FINEST = (1, 2, 4)
-"""Factors on these distances, tried in turn."""
+"""Factors on ``STRIDES``, tried in turn."""
 SHOWN = 10.0
-"""Least length of a recording over a time constant that it identifies: any input explains a few slow motions."""
+"""Least ratio of the length of a recording to a time constant that it identifies: in a shorter one any input explains
+the few slow motions."""
 FAR = 5.0
-"""Least steady-state effect of all inputs, over the output's span, of an output that integrates."""
+"""Steady-state effect of all inputs over the output's span, above which a slow output counts as an integrator."""
 LAGS = 4
 """Past samples from which outputs are predicted."""
 CLOSED = 2.0
-"""Feedback, over its largest value by chance (:func:`~hybrid_mpc.identify.closed_loop.feedback`), above which a loop is
-closed. In eight recordings of machines it was 1.3 at most in open loop, and 2.2 to 34 in detectable closed loops."""
+"""Feedback over its largest value by chance (:func:`~hybrid_mpc.identify.closed_loop.feedback`), above which a loop is
+closed. Eight recordings of machines have at most 1.3 in open loop, and 2.2 to 34 in detectable closed loops."""
 GROWS = 3.0
-"""Least growth over the length of a recording, as an exponent, that is not a drift."""
+"""Least growth over the length of a recording, as an exponent; a smaller one may be a drift."""
 PACE = 0.3
-"""Least growth rate over the rate of the motion itself (rms speed over spread of the slowest output) that is not a bias
-from friction or another nonlinearity: such biases reach 0.15."""
+"""Least growth rate over the rate of the motion itself (rms speed over spread of the slowest output). A smaller one may
+be a bias from friction or another nonlinearity; such biases reach 0.15."""
 AGREE = 0.2
-"""Least ratio of the smallest to the largest of several agreeing growth rates."""
+"""Least ratio of the smallest to the largest of several growth rates that agree."""
 
 
 class Runs(NamedTuple):
-    """Outputs ``(m, n_y)``, NaN where blank, and inputs ``(m, n_u)`` of one recording."""
+    """Outputs ``(m, n_y)``, NaN where a sample is missing, and inputs ``(m, n_u)`` of one recording."""
 
     y: Array
     u: Array
@@ -71,10 +72,10 @@ class Lag:
 
     @property
     def matters(self) -> float:
-        """The time [s] that matters for control: the slowest time constant, or less if inputs reach farther.
+        """The time [s] that matters for control: the slowest time constant, or less if ``reach`` is above 1.
 
-        For a controller, a mode so slow that inputs move the output over its span in a fraction of it is an integrator.
-        For an oscillation it is at most half a period, within which a controller damps it.
+        If inputs move the output over its span in a fraction of the time constant, the output is an integrator for the
+        controller. For an oscillation, the time is at most half a period, within which a controller damps it.
         """
         if self.states == 1:
             return self.seconds / max(self.reach, 1.0)
@@ -87,7 +88,8 @@ class Lag:
     def integrates(self, length: float) -> bool:
         """Whether the output integrates, as far as recordings of this length [s] show it.
 
-        Its slowest time constant is longer than a recording identifies, and inputs would move it far beyond its span.
+        Then the slowest time constant is longer than a recording identifies, and inputs would move the output far
+        beyond its span.
         """
         slow = self.seconds
         if self.states == 2:
@@ -143,7 +145,7 @@ def first_lag(runs: Sequence[Runs], output: int, dt: float, inputs: int) -> Lag:
     if not best:
         return default
     error, lag = best.get(1, best.get(2, (0.0, default)))
-    # largest error of two states over that of one state with which two are used
+    # two states are used if their error is less than this share of that of one state
     if 2 in best and best[2][0] < 0.8 * error:
         lag = best[2][1]
     gains = span / spans * np.array(lag.gains)
@@ -232,9 +234,9 @@ def _free_run_error(tables: Sequence[Array], lag: Lag, dt: float) -> float:
 def slowest(lags: Sequence[Lag], length: float) -> tuple[float, int]:
     """The slowest time constant [s] that matters, and the output's index.
 
-    A time constant counts if inputs explain a part of the output by it, and the recording is ``SHOWN`` times longer.
-    If none counts, the result is at most that part of the recording. An output that no input affects counts only where
-    there is no other one.
+    A time constant counts if its lag explains the share ``MATTERS`` of the output's variance, and the recording is
+    ``SHOWN`` times longer. If none counts, the result is at most the length of the recording over ``SHOWN``. Outputs
+    that no input affects count only if there are no others.
     """
     longest = length / SHOWN
     driven = [i for i, lag in enumerate(lags) if lag.driven] or list(range(len(lags)))
@@ -259,9 +261,9 @@ def feedback_of(runs: Sequence[Runs]) -> float:
 def growth_of(runs: Sequence[Runs], dt: float) -> float:
     """Rate [1/s] at which the machine diverges from its steady state by itself; zero if the data do not show it.
 
-    From the largest pole of predictions over several strides, for all recordings and for either half of them, if these
-    agree. Feedback biases one-step predictions little, unless noise exceeds the motion of a sample: then strides of
-    twice or four times the length may agree.
+    The rate follows from the largest pole of predictions over several strides, fitted to whole recordings and to each
+    half of them. The data show it if all rates agree. Feedback biases one-step predictions little, unless the noise
+    exceeds the motion within a sample; then strides two or four times as long may agree.
     """
     length = dt * max(len(run.y) for run in runs)
     pace = 1 / max(1e-300, *(pace_of(runs, i, dt) for i in range(runs[0].y.shape[1])))
@@ -273,8 +275,8 @@ def growth_of(runs: Sequence[Runs], dt: float) -> float:
 
 
 def _growths(runs: Sequence[Runs], stride: int, dt: float) -> list[float]:
-    """Growth rates [1/s] of predictions over a stride, from all of the recordings and from either half of them;
-    minus infinity for too few rows.
+    """Growth rates [1/s] of predictions over a stride, from whole recordings and from each half of them; minus infinity
+    for too few samples.
     """
     parts, found = _middles(runs, stride), []
     halves = [

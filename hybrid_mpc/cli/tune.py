@@ -11,7 +11,7 @@ from hybrid_mpc.cli.options import InputColumns, OutputColumns, Recordings, Scen
 from hybrid_mpc.rules import MOST_SEED
 
 if TYPE_CHECKING:
-    from hybrid_mpc.identify.tune import SearchResult
+    from hybrid_mpc.workflow.tune import TuneResults
 
 EXAMPLES = (
     "Examples:\n\n"
@@ -57,16 +57,17 @@ def tune(
     )  # fmt: skip
     with make_progress() as progress:
         found = run_tuning(settings, folder, trials=trials, timeout=timeout, resume=resume, progress=progress)
-    print_summary(summary(found, settings.space.names), folder / "results.json")
+    print_summary(summary(found), folder / "results.json")
     print(f"run with these settings: {usage(settings, folder)}")
 
 
-def summary(found: SearchResult, names: tuple[str, ...]) -> list[str]:
-    """One line per trial with the searched settings ``names``, then the best trial."""
+def summary(found: TuneResults) -> list[str]:
+    """One line per trial with the searched settings, then the best trial."""
+    names = list(found.space)
     lines = ["  ".join(["trial", f"{'state':8}", f"{'E_sim':>8}", "   s", *names])]
     for row in found.trials:
         values = [f"{row.values[name]:>{len(name)}.3g}" for name in names]
         head = [f"{row.number:5}", f"{row.state:8}", f"{row.value:8.4g}", f"{row.duration:4.0f}"]
         lines.append("  ".join(head + values))
-    base = "" if found.base is None else f"; initial settings {found.base:.4g}"
+    base = "" if found.base_value is None else f"; initial settings {found.base_value:.4g}"
     return [*lines, f"best: trial {found.best.number} with {found.best.value:.4g} on validation{base}"]

@@ -503,18 +503,27 @@ def run_specs(
     Loops whose monitors use no learned limits run without limits, as in a run whose stage watch has not run yet.
     """
     learned = any(spec.monitor not in ("own", "none") for spec in specs)
-    bench = bench_of(scenario, folder, artifact_digest(folder), learned)
-    return list(run_loops(bench, specs, report))
+    return list(run_loops(bench_of(scenario, folder, learned=learned), specs, report))
 
 
 @lru_cache(maxsize=1)
-def bench_of(scenario: str, folder: Path, content: str, learned: bool) -> Bench:
-    """A bench with the model of a run's folder with digest ``content``; ``learned``: with the monitor's limits.
+def _last_model(folder: Path, content: str) -> tuple[Kit, dict[tuple[str, bool], Bench]]:
+    """A kit, and its benches by scenario and ``learned``. The last one is kept: a process runs many parts with it."""
+    return load(folder), {}
 
-    The last bench is kept, so that a process which runs many parts reads the model once.
-    """
-    kit = load(folder)
-    return Bench(load_scenario(scenario), {MODEL: kit if learned else replace(kit, watch={})})
+
+def kit_of(folder: Path) -> Kit:
+    """The kit in a folder, read again only if one of its files has changed."""
+    return _last_model(folder, artifact_digest(folder))[0]
+
+
+def bench_of(scenario: str, folder: Path, *, learned: bool) -> Bench:
+    """The bench of a scenario with the kit in a folder (:func:`kit_of`); ``learned``: with the monitor's limits."""
+    kit, benches = _last_model(folder, artifact_digest(folder))
+    if (scenario, learned) not in benches:
+        own = kit if learned else replace(kit, watch={})
+        benches[scenario, learned] = Bench(load_scenario(scenario), {MODEL: own})
+    return benches[scenario, learned]
 
 
 def write_rows(path: Path, rows: Sequence[LoopRow], of: str) -> None:

@@ -58,13 +58,13 @@ RESTS = 5.0
 """Largest scatter of a settled output, in standard deviations of its sensor. The sensor noise alone makes 1. Noise that
 the observer passes on to the input adds to it, in an unstable machine several times as much."""
 SLOW = "the observer is slow"
+"""Beginning of the reason of a loop whose estimate of the load does not settle within the trial."""
 AT_ITS_LIMIT = "is at its limit"
 UNREACHED = "the set-point cannot be reached within the limits"
 UNMOVED = "the estimated disturbance does not change: the observer explains every load by its process noise"
 RESTLESS = "the loop does not settle: noise or friction excites it"
 PULLED = "the weight r pulls the input towards the operating point; set r = 0 and weight changes by r_delta"
 BESIDE = "the machine stands still beside its set-point, as with dry friction"
-"""Begin of the reason of a loop whose observer estimates the load, but not within the trial."""
 REMEDIES = (
     (
         (AT_ITS_LIMIT, UNREACHED),
@@ -98,11 +98,11 @@ DIVERGED = 1e12
 GAINS = 1.5
 """Ratio of squared errors from which on disturbances at rates are recommended for loads elsewhere."""
 ROUNDING = 1e-6
-"""Part of a unit load at the rate of a state that the disturbances do not represent, from which on it counts."""
+"""A state counts if the disturbances leave more than this share of a load at its rate unrepresented."""
 AT_LIMIT = 1e-3
 """Distance from a limit, over the input's range, that counts as at the limit."""
 LEAVES = 2.0
-"""Distance of a state from its set-point, in its range, from which on the loop fails."""
+"""Distance of a state from its set-point, over its range, from which on the loop fails."""
 BEFORE = 5
 """Periods before the first failed solve that tell whether an input was at its limit."""
 GROWTHS = 3.0
@@ -195,7 +195,7 @@ class SetPoint:
     def rest(self) -> tuple[Array, Array]:
         """State ``(n_x,)`` and input ``(n_u,)`` of the set-point's steady state.
 
-        If the reference is one of states: this state, and the input that holds it best.
+        If the reference is a state: this state, and the input that holds it best.
 
         Raises:
             InputError: If the set-point has no steady state.
@@ -491,8 +491,9 @@ def trial(point: SetPoint, draw: int, periods: int) -> Trial:
 
 
 def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int = 0, late: int = 0) -> Trial:
-    """A loop of the kit's parts on a plant, from a state ``(n_x,)``, with inputs ``late`` by so many periods; durations
-    are processor time.
+    """A loop of the kit's parts on a plant from the state ``x0`` ``(n_x,)``; inputs act ``late`` periods later.
+
+    Durations are processor time.
     """
     model = point.model
     result = simulate(
@@ -513,8 +514,9 @@ def tried(point: SetPoint, plant: ModelPlant, x0: Array, periods: int, seed: int
 def deviations(
     signals: Sequence[Signal], held: Sequence[int], sigma: Array, errors: Array
 ) -> tuple[Deviation, ...]:
-    """Deviations over the end of a loop, from errors ``(n, n_y)`` of the outputs; NaN are lost samples. NaN if all of
-    them are lost, as after a failure.
+    """Deviations over the end of a loop, from errors ``(n, n_y)`` of the outputs, NaN where a sample is lost.
+
+    A deviation is NaN if all samples are lost, as after a failure.
     """
     late = errors[int((1.0 - END) * len(errors)) :]
     found = []
@@ -765,14 +767,13 @@ def horizon(points: Sequence[SetPoint]) -> Promise:
     if share >= CARRIES:
         return Promise(name, "shown", evidence)
     enough = int(np.argmax(cost <= 1.0 - CARRIES))
-    want = (
-        f"A horizon of {enough} periods contains {100 * CARRIES:.0f} %"
+    remedy = (
+        f"A horizon of {enough} periods contains {100 * CARRIES:.0f} %. A longer dt or move blocks reduce its "
+        "computing time."
         if enough
-        else "Weight drifting states"
+        else "Weight the states that drift, so that the controller brings them back."
     )
-    return Promise(
-        name, "doubted", evidence, f"{want}; a longer dt or move blocks reduce its computing time."
-    )
+    return Promise(name, "doubted", evidence, remedy)
 
 
 def _compute_left_costs(point: SetPoint) -> Array:
@@ -849,8 +850,8 @@ def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
 def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
     """Row "late inputs": a loop on the model itself, with inputs that act later than in the model.
 
-    It starts beside the set-point, by the spread of the controlled outputs in the recordings. The linearized loop shows
-    small motions only: at the limits of the inputs, a large motion can start swings that never end.
+    At the start each controlled output is off its set-point by its spread in the recordings. Margins of the linearized
+    loop hold for small motions only: with inputs at their limits, a large motion can start swings that never end.
 
     Args:
         point: The set-point.
@@ -1039,7 +1040,10 @@ def process_noise(kit: Kit) -> Promise:
 
 
 def innovations(found: Tested | str) -> Promise:
-    """Row "innovations": whether they are nearly white, and as large as assumed, on test recordings; or why unknown."""
+    """Row "innovations": whether they are nearly white, and as large as assumed, on test recordings.
+
+    ``found`` holds their statistics, or the reason why there are none.
+    """
     name = "innovations"
     if isinstance(found, str):
         return Promise(name, "not promised", found, "Give longer test recordings.")
@@ -1096,9 +1100,9 @@ def disturbance_model(points: Sequence[SetPoint], trials: Sequence[Trial]) -> Pr
 def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
     """Row "loads elsewhere": loops on the model itself, with a constant load at the rate of a state.
 
-    States count whose load the disturbances do not represent within a period. A load has the effect of an error of 20 %
-    in one parameter. The loops are compared with those of disturbances at the rates of the measured states, if the
-    outputs measure states of their own. None if no state counts, and without weights of outputs.
+    A state counts if the disturbances do not represent its load within a period. A load has the effect of an error of
+    20 % in one parameter. If each output measures another state, the loops are compared with loops whose disturbances
+    act at the rates of these states. None if no state counts, or if no output has a weight.
 
     Args:
         kit: The kit.
@@ -1124,7 +1128,7 @@ def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
     what += f" with the effect of a parameter {100 * OFF:.0f} % off"
     where = f"in loops of {n * point.model.dt:.3g} s on the model itself, {point.title}"
     if not off and gain < GAINS:
-        return Promise(name, "shown", f"{what}, leave no offset {where}")
+        return Promise(name, "shown", f"{what} leave{'' if many else 's'} no offset {where}")
     if rates is not None and gain >= GAINS:
         declared = ", ".join(f'Disturbance("rate", "{d.signal}", {d.size:.2g})' for d in rates)
         evidence = (
@@ -1142,7 +1146,7 @@ def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
 
 
 def _with_disturbances(kit: Kit, point: SetPoint, chosen: tuple[Disturbance, ...]) -> SetPoint | None:
-    """The same set-point with another disturbance model; None if the kit's noise makes no observer of it."""
+    """The same set-point with another disturbance model; None if no observer can be made with the kit's noise."""
     of = kit.with_disturbances(chosen)
     task = next((name for name in point.tasks[:1] if name in kit.loop.control), "")
     try:
@@ -1291,4 +1295,4 @@ def _find_prior_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
 
 def _explain_longer_trial(longer: Trial) -> str:
     seconds = len(longer.result.t) * longer.result.dt
-    return f"in a loop of {seconds:.3g} s it {'does not settle either' if longer.why else 'settles'}"
+    return f"a loop of {seconds:.3g} s {'does not settle either' if longer.why else 'settles'}"

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.compare.loops import LoopSpec, ModeChange, bench_of
-from hybrid_mpc.kit.artifact import Kit, load
-from hybrid_mpc.kit.parts import LoopSettings, artifact_digest
+from hybrid_mpc.compare.loops import LoopSpec, ModeChange, bench_of, kit_of
+from hybrid_mpc.kit.artifact import Kit
+from hybrid_mpc.kit.parts import LoopSettings
 from hybrid_mpc.watch.explain import begun, explained
 from hybrid_mpc.watch.monitor import Monitor, make_readings
 from hybrid_mpc.watch.readings import Readings
@@ -37,7 +36,7 @@ def traces_of(
         record: See :func:`~hybrid_mpc.watch.replay.replay`.
         report: Called with ``(done, total, text)``, counted in samples.
     """
-    kit = replace(_kit_of(folder, artifact_digest(folder)), loop=loop)
+    kit = replace(kit_of(folder), loop=loop)
     text = f"samples, {getattr(record, 'name', '')}"
     monitors = [Monitor(readings_of(kit, name, kind, rest)) for kind in kinds]
     found = replays(
@@ -54,11 +53,6 @@ def readings_of(kit: Kit, name: str, kind: str, rest: tuple[float, ...] | None) 
     """
     span = kit.problem().input_range if kit.loop.control else None
     return make_readings(kit.models[name], kind, rest_speed=rest, input_range=span)
-
-
-@lru_cache(maxsize=1)
-def _kit_of(folder: Path, content: str) -> Kit:
-    return load(folder)
 
 
 @dataclass(frozen=True)
@@ -86,7 +80,7 @@ class Faulted:
 
 def faulted(scenario: str, folder: Path, spec: LoopSpec, start: float, report: Report) -> Faulted:
     """Run a loop whose fault begins at ``start`` [s], and diagnose the first alarm after it."""
-    bench = bench_of(scenario, folder, artifact_digest(folder), True)
+    bench = bench_of(scenario, folder, learned=True)
     kit = bench.kit(spec)
     row, result = bench.run(spec)
     # the estimator is deterministic: a replay of the record repeats its estimates in the loop

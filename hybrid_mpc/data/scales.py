@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,32 @@ class Sizes:
     noise: tuple[float, ...]
     x: tuple[float, ...]
     rate: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmootherSettings:
+    """What a smoother assumes about noise and unexplained rates: part of a fit, of a smoother, and of a kit.
+
+    Args:
+        sigma: Standard deviation of the measurement of each output ``(n_y,)`` [output units].
+        walk: Standard deviation of the change of each unexplained rate in one period ``(n_d,)`` [units of the corrected
+            rates].
+        sizes: Natural sizes of the signals.
+        fading: Factor by which an unexplained rate decays in one period without data [-]. Default: 1, no decay.
+        substeps: Runge-Kutta sub-steps a period that the prior needs within the range of the recordings. Default 0: as
+            many as it needs at rest.
+    """
+
+    sigma: tuple[float, ...]
+    walk: tuple[float, ...]
+    sizes: Sizes
+    fading: float = 1.0
+    substeps: int = 0
+
+    @property
+    def smoother_settings(self) -> dict[str, Any]:
+        """These settings by name, to make another record that has them."""
+        return {f.name: getattr(self, f.name) for f in fields(SmootherSettings)}
 
 
 class Outputs(Protocol):

@@ -1,8 +1,8 @@
-"""Predictions from an observer's state: horizons ahead, after it has watched a recording so far.
+"""Predictions over a horizon, from the observer's estimates along a recording.
 
-A free run from a warm-up forgets what the observer has learned since: the state, disturbances, and tracked parameters.
-Here the observer runs along a recording, and from its estimate at each start the model predicts the horizon under the
-inputs and disturbances that were measured; unmeasured disturbances and tracked parameters are held.
+A free run uses the samples of its warm-up alone. An observer uses all samples so far, and also estimates disturbances
+and tracked parameters. At each start, the model predicts the horizon from the observer's estimate, with the measured
+inputs and disturbances. Unmeasured disturbances and tracked parameters are held constant.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from hybrid_mpc.model.model import HybridModel
 
 Array = NDArray[np.float64]
 STARTS = 4
-"""Starts of predictions in a horizon."""
+"""Number of predictions that start within one horizon."""
 BETTER = 0.97
 """Ratio of errors below which a further tracked parameter is used."""
 HARM = 1.02
-"""Largest ratio of an output's error to that without tracking that counts as no harm."""
+"""Ratio of an output's error with tracking to that without, up to which tracking does no harm."""
 WATCHED, RECORDINGS = 1500, 12
-"""Periods of a recording, and recordings, evenly chosen, at most over which observers are compared."""
+"""Largest number of periods of a recording, and of evenly chosen recordings, over which observers are compared."""
 UNLEARNED = 0.5
-"""Ratios above which the recordings do not separate load and parameter: of a parameter's standard deviation late in a
-recording to that at its start, and of the load with tracking to that without. In an example with a missing lag they are
-0.87 and 0.75, without it 0.2 and 0.3."""
+"""The recordings do not separate load and parameter if two ratios exceed this value: a parameter's standard deviation
+late in a recording over that at its start, and the load with tracking over the load without. In an example the ratios
+are 0.87 and 0.75 if the prior lacks a lag, and 0.2 and 0.3 if it has the lag."""
 LATE_ESTIMATES = 8
-"""Estimates in the second half of a recording, over which loads and standard deviations are compared."""
+"""Number of estimates in the second half of a recording, over which loads and standard deviations are compared."""
 FAR = 1e6
-"""Limit of an error, over that of the untracked observer, also for diverging predictions."""
+"""Largest ratio of an error to that without tracking; predictions that diverge have this ratio."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,10 @@ def errors_ahead(
 
     Args:
         observer: The observer; its model predicts.
-        recordings: Recordings on the model's grid, inputs as commanded. Those too short for a prediction are left out.
+        recordings: Recordings on the model's grid, inputs as commanded. Recordings that are too short for a
+            prediction are left out.
         horizon: Length [s] of each prediction.
-        warm_up: Time [s] that the observer watches before the first prediction. Default: none.
+        warm_up: Time [s] that the observer runs before the first prediction. Default: none.
         every: Periods between two starts. Default: a quarter of the horizon.
 
     Raises:
@@ -119,7 +120,7 @@ def _watched(observer: Filter | TrackingFilter, t: Trajectory, ks: Sequence[int]
 def _rmse(
     model: HybridModel, t: Trajectory, estimates: Sequence[Estimate], ks: Sequence[int], periods: int
 ) -> Array:
-    """Root mean square errors ``(n_y,)`` of predictions from all starts side by side; infinite where one diverges."""
+    """Root mean square errors ``(n_y,)`` of all predictions, computed at once; infinite if one diverges."""
     m, (on_u, on_x, on_y) = len(ks), model.disturbed
     step, output = model.step.map(m), model.output.map(m)
     x, h, d = (np.array([getattr(e, key) for e in estimates]).reshape(m, -1) for key in "xhd")
@@ -149,14 +150,14 @@ def _with(t: Trajectory, places: NDArray[np.intp], n_w: int, held: Array) -> Arr
 
 @dataclass(frozen=True)
 class Tracking:
-    """The parameters to track, and what tracking changes in predictions of the recordings that chose them.
+    """The parameters to track, and how tracking changes predictions of the recordings that they were chosen by.
 
     Args:
         tracked: The parameters; empty if tracking does not improve predictions.
-        ratio: Error of predictions over that without tracking, by output [-]. Default: 1 each.
+        ratio: Error of predictions over that without tracking, by output [-]; 1 without tracked parameters.
         horizon: Length [s] of the predictions.
-        tried: Mean ratio of errors by the tried parameters, ``"a, b"``.
-        doubts: Reasons to doubt that the tracked parameters are what changes. Default: none.
+        tried: Mean ratio of errors of each set of parameters that was tried, by their names, ``"a, b"``.
+        doubts: Reasons why something other than the tracked parameters may change. Default: none.
     """
 
     tracked: tuple[TrackedParameter, ...]
@@ -175,22 +176,22 @@ def choose_tracked(
 ) -> Tracking:
     """Choose the parameters whose tracking improves predictions from the observer's state.
 
-    Candidates are the parameters whose own variation between recordings has evidence
-    (:func:`~hybrid_mpc.identify.varying.find_varying`). They enter one after the other, the best first, as long as the
-    error falls by 3 % and no output's rises by 2 %, in each set of evidence. All varying parameters together, and all
-    candidates together, are tried, too. A parameter that the user declares as varying is always tracked. Parameters in
-    the output equation are no candidates.
+    Candidates are the parameters for whose variation between recordings there is evidence
+    (:func:`~hybrid_mpc.identify.varying.find_varying`), except parameters in the output equation. The best candidate is
+    added, one after the other, as long as the error falls by 3 % and no output's error rises by 2 % in each set of
+    evidence. All varying parameters together and all candidates together are also tried. A parameter that the user
+    declares as varying is always tracked.
 
-    Two sets are needed, since each alone is biased. A prior that was fitted to the very recordings is closer to them
-    than to new ones, so tracking has less to gain. A prior that was fitted to fewer recordings is worse than the one
-    that is used, so tracking has more to gain.
+    Two sets are needed, because each alone is biased. A prior fitted to the same recordings predicts them better than
+    new ones, so the gain by tracking is too small. A prior fitted to fewer recordings is worse than the deployed prior,
+    so the gain is too large.
 
     Args:
-        watched: Sets of evidence. Each has observers without tracking, each with the recordings that it is judged by.
-            12 recordings of an observer at most count, and 1500 periods of each recording.
+        watched: Sets of evidence: observers without tracking, each with the recordings that evaluate it. At most 12
+            recordings of an observer are used, and at most 1500 periods of each.
         varying: Variation of the parameters.
         horizon: Length [s] of the predictions.
-        warm_up: Time [s] that the observer watches before the first prediction. Default: none.
+        warm_up: Time [s] that the observer runs before the first prediction. Default: none.
     """
     sets = [
         [(o, [own[i].part(slice(WATCHED)) for i in evenly(len(own), RECORDINGS)]) for o, own in one]
@@ -216,9 +217,9 @@ def choose_tracked(
     tried: dict[str, float] = {}
 
     def judged(chosen: Sequence[TrackedParameter], needed: float = math.inf) -> tuple[float, Array]:
-        """Mean ratio of errors over recordings and outputs, and that of each output: the worst of the sets.
+        """Mean ratio of errors over recordings and outputs, and the ratio of each output: the largest of all sets.
 
-        Sets after one whose ratio exceeds ``needed`` are skipped, since the worst set decides.
+        Once the mean ratio of a set exceeds ``needed``, the other sets are skipped: the largest ratio decides.
         """
         outputs: list[Array] = []
         for one, floor, (_, starts) in zip(sets, floors, plain, strict=True):
@@ -258,9 +259,9 @@ def choose_tracked(
 def _unlearned(
     observer: Filter, recordings: Sequence[Trajectory], chosen: Sequence[TrackedParameter]
 ) -> tuple[str, ...]:
-    """A doubt where the observer hardly learns a tracked parameter, while the load stays nearly as large as without it.
+    """A doubt if the observer hardly learns a tracked parameter, and the load is nearly as large as without tracking.
 
-    Then the load explains what the parameter should: both replace a term that the prior lacks.
+    Then load and parameter explain the same errors: both replace a term that the prior lacks.
     """
     tracking, n_d = TrackingFilter(observer, chosen), observer.model.n_d
     loads, stds = [], []

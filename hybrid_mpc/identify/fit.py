@@ -274,13 +274,9 @@ def fit_prior(
         stages=stages,
         correlations=correlations(fit, chosen),
         delay=fit.delay(chosen.theta),
-        sigma=smoother.sigma,
-        walk=smoother.walk,
-        sizes=smoother.sizes,
-        fading=smoother.fading,
-        substeps=smoother.substeps,
         unidentified=chosen.unidentified,
         lacking_delay=lacking,
+        **smoother.smoother_settings,
     )
 
 

@@ -34,21 +34,22 @@ class Predicted:
     """Predicted outputs, and their errors.
 
     Args:
-        y_hat: Predictions ``(n, n_y)`` [output units]; one-step predictions are NaN for missing samples.
-        half_width: Half widths of the band ``(n, n_y)``; NaN without a band.
         rmse: Root mean square of the residuals by output, ``"phi [rad]"``; None if a run diverged.
         fit_percent: ``100 (1 - RMSE / standard deviation of the measurement)`` by output; None if a run diverged or the
             output is constant.
         inside: Share of the measurements within the band, by output; None without a band.
         share: Nominal share of the band.
+        y_hat: Predictions ``(n, n_y)`` [output units]; one-step predictions are NaN for missing samples. Empty if read
+            from a file.
+        half_width: Half widths of the band ``(n, n_y)`` [output units]; NaN without a band. Empty if read from a file.
     """
 
-    y_hat: Array = field(metadata=BESIDE)
-    half_width: Array = field(metadata=BESIDE)
     rmse: Mapping[str, float | None]
     fit_percent: Mapping[str, float | None]
     inside: Mapping[str, float | None]
     share: float
+    y_hat: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False, metadata=BESIDE)
+    half_width: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False, metadata=BESIDE)
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     n = len(acting.t) if length is None else max(1, round(length / dt))
     begins = range(0, len(acting.t) - warm, n)
     runs = [acting.part(slice(a, a + warm + n)) for a in begins]
-    smoother = Smoother(prior, dt, held.sigma, held.walk, held.sizes, held.fading, held.substeps)
+    smoother = Smoother(prior, dt, **held.smoother_settings)
     starts = smoother.smooth([run.part(slice(0, warm + 1)) for run in runs])
     parts = [
         _banded(kit, name, prior, run, start.x, trajectory.part(slice(a, a + lost + warm + n)))
@@ -281,4 +282,4 @@ def _predicted(hat: Array, half: Array, y: Array, outputs: Sequence[Signal], sha
         fit[signal.label] = 100 * (1 - error / size) if size > 0 and np.isfinite(error) else None
         banded = np.isfinite(half[seen, j])
         inside[signal.label] = float(np.mean(off[banded] <= half[seen, j][banded])) if banded.any() else None
-    return Predicted(hat, half, rmse, fit, inside, share)
+    return Predicted(rmse, fit, inside, share, hat, half)

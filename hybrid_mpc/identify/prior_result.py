@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from hybrid_mpc.data.scales import Sizes
-from hybrid_mpc.errors import InputError, named_extra
+from hybrid_mpc.data.scales import SmootherSettings
+from hybrid_mpc.errors import named_extra
 from hybrid_mpc.identify.smooth import Smoother
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Parameter
@@ -82,8 +82,8 @@ class Combination:
 
 
 @dataclass(frozen=True)
-class PriorFit:
-    """Fitted parameters with their standard errors.
+class PriorFit(SmootherSettings):
+    """Fitted parameters with their standard errors, and the settings of the smoother around the fitted prior.
 
     Args:
         values: Values [SI] of all parameters by name, fitted and fixed.
@@ -93,12 +93,6 @@ class PriorFit:
         stages: One row for each stage of the fit: its name and its validation error, which selects the stage.
         correlations: Correlation of the errors of every two fitted parameters, by ``"a, b"``. Default: none known.
         delay: Delay of the inputs [s]. Default: none.
-        sigma: Standard deviation of each output's measurement in the smoother [output units].
-        walk: Standard deviation of the change of each unexplained rate in one period, by corrected state.
-        sizes: Natural sizes of the signals in the smoother.
-        fading: Factor by which an unexplained rate decays in one period without data [-].
-        substeps: Runge-Kutta sub-steps a period that the fitted prior needs within the range of the recordings.
-            Default 0: as many as it needs at rest.
         unidentified: Parameters that are not identifiable one by one. Default: none.
         lacking_delay: Delay of the inputs [s] that the recordings show and the prior lacks. Default: none.
     """
@@ -109,19 +103,12 @@ class PriorFit:
     stages: tuple[dict[str, Any], ...]
     correlations: dict[str, float] = field(default_factory=dict)
     delay: float = 0.0
-    sigma: tuple[float, ...] = ()
-    walk: tuple[float, ...] = ()
-    sizes: Sizes | None = None
-    fading: float = 1.0
-    substeps: int = 0
     unidentified: tuple[Combination, ...] = ()
     lacking_delay: float = 0.0
 
     def smoother(self, prior: Prior, dt: float) -> Smoother:
         """The smoother around the fitted prior."""
-        if self.sizes is None:
-            raise InputError("fit: this fit has no smoother. Use a fit of fit_prior [HM-IDENTIFY-045]")
-        return Smoother(prior, dt, self.sigma, self.walk, self.sizes, self.fading, self.substeps)
+        return Smoother(prior, dt, **self.smoother_settings)
 
     @property
     def best(self) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from hybrid_mpc.data import scales
-from hybrid_mpc.data.scales import Sizes, evenly, robust_spread
+from hybrid_mpc.data.scales import Sizes, SmootherSettings, evenly, robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.identify.horizon import Horizon, Stretches
 from hybrid_mpc.identify.simulation import (
@@ -59,7 +59,7 @@ UNSEEN = 1e-6
 
 
 @dataclass(frozen=True)
-class Smoother:
+class Smoother(SmootherSettings):
     """Smoother: most likely ``(x, d)`` of recordings, with unexplained rates ``d`` of the corrected states.
 
     Model: ``x_{k+1} = f(x_k, u_k, w_k, d_k)`` is the prior integrated over a period with constant ``d_k``; ``d`` is a
@@ -73,11 +73,6 @@ class Smoother:
     Args:
         prior: The fitted prior.
         dt: Period [s].
-        sigma: Standard deviation of the measurement ``(n_y,)`` [output units].
-        walk: Standard deviation of the change of d in one period ``(n_d,)`` [units of the corrected rates].
-        sizes: Natural sizes of the signals (:func:`sizes_of`).
-        fading: Decay factor of ``d`` in one period [-]. Default: 1, no decay.
-        substeps: Runge-Kutta sub-steps a period. Default 0: as many as the prior needs at rest.
 
     Source: as for the horizon; for the filter that gives its start and the innovations: Jazwinski, *Stochastic
     processes and filtering theory* (1970), section 8.3.
@@ -85,11 +80,6 @@ class Smoother:
 
     prior: Prior
     dt: float
-    sigma: tuple[float, ...]
-    walk: tuple[float, ...]
-    sizes: Sizes
-    fading: float = 1.0
-    substeps: int = 0
 
     def smooth(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
         """Estimate ``x`` and ``xdot`` of every trajectory from its own samples."""
@@ -434,7 +424,10 @@ def _smoothers(
 
     def at(ratio: float, scale: float = 1.0) -> Smoother:
         sigma, walk = scale * np.array(sizes.noise), scale * 10.0**ratio * rates
-        return Smoother(prior, dt, tuple(sigma.tolist()), tuple(walk.tolist()), sizes, fading, substeps)
+        return Smoother(
+            prior, dt, sigma=tuple(sigma.tolist()), walk=tuple(walk.tolist()), sizes=sizes, fading=fading,
+            substeps=substeps,
+        )  # fmt: skip
 
     return at
 

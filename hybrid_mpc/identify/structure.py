@@ -101,8 +101,8 @@ class Cause:
         why: Description of the mistake.
         ratio: Free-run error after the correction over the error before it [-].
         factor: Fitted factor of the term; NaN without a factor. Default: NaN.
-        before: Whether there is an error before the correction; if the prior cannot be fitted with the mistake, the
-            ratio is over the outputs' spread. Default: True.
+        before: False: the prior cannot be fitted with the mistake, so there is no error before the correction, and
+            ``ratio`` is over the outputs' spread. Default: True.
 
     Example:
         >>> print(Cause("k * u", "its sign seems wrong", 0.1, -1.02))
@@ -369,9 +369,9 @@ class _Lenient(OutputFit):
 
 
 class _FactorFit(_Lenient):
-    """Parameters and the factor of one term; with several ``theta``, ``chosen`` is the term of each.
+    """Parameters and the factor of one term.
 
-    A negative number stands for no term.
+    ``chosen`` holds the number of the term of each ``theta``; a negative number means no term.
     """
 
     def __init__(
@@ -466,14 +466,14 @@ def causes(
     time_unit: float,
     on_progress: Callable[[str], None] = lambda text: None,
 ) -> tuple[Cause, ...]:
-    """Search mistakes in a prior that explain its errors on recordings; the likeliest first, then equally likely ones.
+    """Search a prior for mistakes that explain its errors on recordings: the likeliest, then equally likely ones.
 
     Each term of the equations and each signal gets a factor in turn. The factor is fitted with all parameters, from 1,
     from -1, and from the unit errors with the least error over short runs. If no factor explains the error, the signs
     of outputs are changed, signals of a kind are exchanged, and angles are shifted by quarter turns.
 
-    A mistake is reported if its correction reduces the error of free runs below ``NAMED`` times the error before; below
-    ``GUESSED`` if the factor does not identify the mistake (:func:`reading_of`).
+    A mistake is reported if its correction reduces the error of free runs below ``NAMED`` times the error before. If
+    the factor does not identify the mistake (:func:`reading_of`), the limit is ``GUESSED``.
 
     Args:
         make: Prior class or factory ``(values=None) -> Prior``.
@@ -571,7 +571,7 @@ def _explained(
 def causes_of_refusal(
     make: Callable[..., Prior], recorded: Sequence[Trajectory], dt: float, longest: float, time_unit: float
 ) -> tuple[Cause, ...]:
-    """Search unit and sign errors of a prior that is refused as too stiff for the period, or as not observable.
+    """Search for unit and sign errors of a prior that is refused as too stiff for the period, or as not observable.
 
     If a factor on a term makes the prior usable, its parameters are fitted to short runs. ``ratio`` is then the error
     of free runs with the correction, over the outputs' spread.
@@ -703,8 +703,8 @@ def _cause(
 ) -> Cause:
     """Cause that a term's factor shows.
 
-    A value of ``READINGS`` is preferred if its error is as small as any other; of several, the one whose parameters are
-    nearest to their nominal values.
+    A value of ``READINGS`` is preferred if its error is close to the least (``BETTER``). Of several such values, the
+    value whose parameters are nearest to their nominal values is taken.
     """
     name = fit.term_names[term]
     why = reading_of(float(free.theta[-1]), _needed(fit, problem, term, free))

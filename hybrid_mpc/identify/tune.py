@@ -28,7 +28,7 @@ from hybrid_mpc.identify.settings import TrainingSettings
 from hybrid_mpc.identify.train import Trained, train
 from hybrid_mpc.machine.prior import Prior
 
-Values = Mapping[str, float]
+Values = Mapping[str, int | float]
 Progress = Callable[[int, int, int, float], None]
 STUDY = "hybrid-mpc tune"
 FINISHED = 4

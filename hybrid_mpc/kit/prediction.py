@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_mpc.data.scales import Sizes
+from hybrid_mpc.data.scales import SmootherSettings
 from hybrid_mpc.machine.specification import DataSpec
 
 Array = NDArray[np.float64]
@@ -48,27 +48,17 @@ class Bands:
 
 
 @dataclass(frozen=True)
-class Predicting:
-    """Settings that predictions of a recording need besides the models.
+class Predicting(SmootherSettings):
+    """Settings that predictions of a recording need besides the models, with those of the warm-up's smoother.
 
     Args:
         data: How recordings are read; its ``free_run`` is the length of the run's free runs.
         corrects: States whose rates a network may correct.
-        sigma: Sensor noise of the warm-up's smoother [output units].
-        walk: Standard deviation of the change per period of each unexplained rate in the smoother.
-        sizes: Natural sizes of the signals in the smoother.
-        fading: Factor of an unexplained rate after a period [-]. Default: 1.
-        substeps: Runge-Kutta sub-steps a period of the fitted prior. Default: 0.
         bands: Bands around free runs, by model. Default: none.
         longest: Length [s] of the longest free run of their calibration. Default: 0, unknown.
     """
 
     data: DataSpec
     corrects: tuple[str, ...]
-    sigma: tuple[float, ...]
-    walk: tuple[float, ...]
-    sizes: Sizes
-    fading: float = 1.0
-    substeps: int = 0
     bands: Mapping[str, Bands] = field(default_factory=dict)
     longest: float = 0.0

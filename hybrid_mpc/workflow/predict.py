@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hybrid_mpc.data.files import write_csv
@@ -13,9 +13,60 @@ from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError, refuse
 from hybrid_mpc.files import write_json
 from hybrid_mpc.identify.delay import lost_samples
-from hybrid_mpc.identify.predict import Prediction, predict
+from hybrid_mpc.identify.predict import Predicted, Prediction, predict
 from hybrid_mpc.kit.artifact import Kit
 from hybrid_mpc.records import known
+from hybrid_mpc.workflow.stage import read_as
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class RecordingErrors:
+    """Errors of the predictions of one recording.
+
+    Args:
+        recording: Name of the recording.
+        seconds: Length after the warm-up [s].
+        run_length: Length [s] of the free runs, one after the other; None: one run over the recording.
+        free_run: Errors of the free runs.
+        one_step: Errors of the one-step predictions; None without them.
+        reason: Why there are no one-step predictions; empty if there are.
+    """
+
+    recording: str
+    seconds: float
+    run_length: float | None
+    free_run: Predicted
+    one_step: Predicted | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class PredictResults:
+    """``predict.json`` of ``hybrid-mpc predict``.
+
+    Args:
+        schema_version: Version of the file.
+        model: Name of the model.
+        recordings: Errors by recording.
+    """
+
+    schema_version: int
+    model: str
+    recordings: tuple[RecordingErrors, ...]
+
+
+def read_predictions(path: Path) -> PredictResults:
+    """Read a ``predict.json``, checked; arrays are empty.
+
+    Raises:
+        InputError: If the file is missing, damaged, or of another version.
+
+    Example:
+        ``read_predictions(Path("today/predict.json")).recordings[0].free_run.rmse``
+    """
+    return read_as(PredictResults, SCHEMA_VERSION, path, "hybrid-mpc predict")
 
 
 def read_recordings_of(kit: Kit, paths: Sequence[Path]) -> tuple[list[Trajectory], list[str]]:
@@ -92,13 +143,9 @@ def predict_recordings(
         )
         save(figure, out / f"{name}.png")
         found.append(one)
-    figures = [
-        {
-            "recording": one.name, "seconds": one.seconds, "run_length": one.run_length,
-            "free_run": one.free_run, "one_step": one.one_step, "reason": one.reason,
-        }
-        for one in found
-    ]  # fmt: skip
-    write_json(out / "predict.json", {"model": found[0].model, "recordings": figures})
+    rows = tuple(
+        RecordingErrors(p.name, p.seconds, p.run_length, p.free_run, p.one_step, p.reason) for p in found
+    )
+    write_json(out / "predict.json", PredictResults(SCHEMA_VERSION, found[0].model, rows))
     say.finish("")
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from hybrid_mpc.engine import Progress
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import write_json, write_text
 from hybrid_mpc.folder import JobNote, open_folder, versions
-from hybrid_mpc.identify.tune import SearchResult, SearchSpace, check_numbers, tune
+from hybrid_mpc.identify.settings import TrainingSettings
+from hybrid_mpc.identify.tune import SearchResult, SearchSpace, TrialRow, check_numbers, tune
 from hybrid_mpc.plots import tune as plots
 from hybrid_mpc.plots.style import save
 from hybrid_mpc.report.page import Cell, Table
@@ -19,7 +21,7 @@ from hybrid_mpc.rules import counted
 from hybrid_mpc.scenario import load_scenario
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.settings import RunSettings
-from hybrid_mpc.workflow.stage import bring_up_to_date
+from hybrid_mpc.workflow.stage import bring_up_to_date, read_as
 from hybrid_mpc.workflow.stages.identify import DATA, MODELS, PRIOR, check_data, training_settings
 
 SCHEMA_VERSION = 1
@@ -48,6 +50,70 @@ class TuneSettings(RunSettings):
             )
 
 
+@dataclass(frozen=True)
+class TuneData:
+    """The recordings of a search.
+
+    Args:
+        hash: Hash of their contents.
+        warnings: Warnings about the recordings.
+    """
+
+    hash: str
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TuneResults:
+    """``results.json`` of ``hybrid-mpc tune``.
+
+    Args:
+        schema: ``"hybrid-mpc tune"``.
+        schema_version: Version of the file.
+        scenario: Registered name, or the name in the scenario file.
+        seed: Seed of data, trainings and search.
+        budget: ``quick``, ``full``, or a budget of the scenario.
+        kind: Kind of network.
+        space: Bounds of the searched settings.
+        base_settings: Settings of the first trial, and all settings that are not searched.
+        versions: Versions of the packages by name.
+        data: Recordings.
+        base_value: Validation error with ``base_settings``; None if these are outside the space.
+        best: The best trial.
+        settings: Settings of the best trial, as in ``settings.json``.
+        importance: Share of each setting in the variation of the errors; empty if unknown.
+        trials: All trials.
+    """
+
+    schema: str
+    schema_version: int
+    scenario: str
+    seed: int
+    budget: str
+    kind: str
+    space: Mapping[str, tuple[int | float, int | float]]
+    base_settings: TrainingSettings
+    versions: Mapping[str, str]
+    data: TuneData
+    base_value: float | None
+    best: TrialRow
+    settings: Mapping[str, int | float | tuple[float, ...]]
+    importance: Mapping[str, float]
+    trials: tuple[TrialRow, ...]
+
+
+def read_tuning(path: Path) -> TuneResults:
+    """Read a ``results.json`` of ``hybrid-mpc tune``, checked.
+
+    Raises:
+        InputError: If the file is missing, damaged, or of another version.
+
+    Example:
+        ``read_tuning(Path("runs/tune/results.json")).best.value``
+    """
+    return read_as(TuneResults, SCHEMA_VERSION, path, "hybrid-mpc tune")
+
+
 def run_tuning(
     settings: TuneSettings,
     out: Path,
@@ -56,7 +122,7 @@ def run_tuning(
     timeout: float | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-) -> SearchResult:
+) -> TuneResults:
     """Search the settings of one kind of network, and write settings, tables and figures into ``out``.
 
     Stages data and prior are those of a run with the same seed, so a run with the best settings trains the networks of
@@ -100,8 +166,7 @@ def run_tuning(
             ),
         )
         context.progress.finish(counted(len(found.trials), "trial"))
-        _write(context, settings, found)
-        return found
+        return _write(context, settings, found)
 
 
 def usage(settings: RunSettings, out: Path) -> str:
@@ -111,28 +176,16 @@ def usage(settings: RunSettings, out: Path) -> str:
     return shlex.join(["hybrid-mpc", "run", settings.scenario, *settings.options(str), *effort, *found])
 
 
-def _write(context: Context, settings: TuneSettings, found: SearchResult) -> None:
+def _write(context: Context, settings: TuneSettings, found: SearchResult) -> TuneResults:
     out, names = context.out, settings.space.names
     fields = dict.fromkeys("learning_rates" if name in RATES else name for name in names)
     best = {name: getattr(found.settings, name) for name in fields}
     data = context.read(DATA)
-    results = {
-        "schema": "hybrid-mpc tune",
-        "schema_version": SCHEMA_VERSION,
-        "scenario": context.scenario.name,
-        "seed": settings.seed,
-        "budget": settings.budget,
-        "kind": settings.kind,
-        "space": {name: settings.space.bounds(name) for name in names},
-        "base_settings": training_settings(context, settings.kind),
-        "versions": versions(),
-        "data": {"hash": data.hash, "warnings": data.warnings},
-        "base_value": found.base,
-        "best": found.best,
-        "settings": best,
-        "importance": found.importance,
-        "trials": found.trials,
-    }
+    results = TuneResults(
+        "hybrid-mpc tune", SCHEMA_VERSION, context.scenario.name, settings.seed, settings.budget, settings.kind,
+        {name: settings.space.bounds(name) for name in names}, training_settings(context, settings.kind), versions(),
+        TuneData(data.hash, data.warnings), found.base, found.best, best, found.importance, found.trials,
+    )  # fmt: skip
     rows: list[tuple[Cell, ...]] = [
         (t.number, t.state, t.value, t.mean, t.steps, t.duration, *(t.values[n] for n in names))
         for t in found.trials
@@ -145,3 +198,4 @@ def _write(context: Context, settings: TuneSettings, found: SearchResult) -> Non
     save(plots.settings(searched, *drawn), out / "figures" / "tune_settings.png")
     write_json(out / "settings.json", best)
     write_json(out / "results.json", results)
+    return results

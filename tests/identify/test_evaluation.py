@@ -125,7 +125,7 @@ def test_the_true_model_runs_along_the_measurement():
 def test_short_runs_start_every_fifth_of_their_length():
     run, warm = record(3, seconds=2.0), 25
     prior = Pendulum(TRUTH)
-    smoother = Smoother(prior, DT, (1e-3,), (0.1,), sizes_of(prior, [run], DT, 1.0))
+    smoother = Smoother(prior, DT, sigma=(1e-3,), walk=(0.1,), sizes=sizes_of(prior, [run], DT, 1.0))
     pieces = evaluation_trajectories([run], smoother, warm, 0.5)
     # 100 samples; 25 of warm-up, 25 periods of the run; a start every 5 samples
     assert [p.t[0] for p in pieces] == pytest.approx(run.t[0 : 100 - 50 : 5])
@@ -138,7 +138,7 @@ def test_a_free_run_knows_nothing_of_the_measurement_after_its_start():
     later = replace(run, x=run.x.copy(), y=run.y.copy())
     later.x[warm + 1 :], later.y[warm + 1 :] = 9.0, 9.0
     step, h = PriorStep(prior, DT), torch.zeros(0).double()
-    smoother = Smoother(prior, DT, (1e-3,), (0.1,), sizes_of(prior, [run], DT, 1.0))
+    smoother = Smoother(prior, DT, sigma=(1e-3,), walk=(0.1,), sizes=sizes_of(prior, [run], DT, 1.0))
     ours, theirs = (
         free_runs(step, prior, evaluation_trajectories([r], smoother, warm), warm, h)[0] for r in (run, later)
     )

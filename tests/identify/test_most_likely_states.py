@@ -190,6 +190,6 @@ def test_a_recording_of_nonsense_gives_finite_states_within_thrice_their_ranges(
     u, y = rng.uniform(-5, 5, (n, 1)), rng.uniform(-1e3, 1e3, (n, 1))
     run = Trajectory("noise", "train", 0.01, 0.01 * np.arange(n), u, y, nothing, nothing)
     sizes = Sizes((1.0,), (1e-3,), (1.0, 10.0), (1.0, 10.0))
-    found = Smoother(Runaway(), 0.01, (1e-3,), (0.1,), sizes).smooth([run])[0]
+    found = Smoother(Runaway(), 0.01, sigma=(1e-3,), walk=(0.1,), sizes=sizes).smooth([run])[0]
     assert np.isfinite(found.x).all()
     assert (np.abs(found.x) <= [12.0, 180.0]).all()

@@ -69,7 +69,7 @@ def test_what_judges_a_network_neither_trains_it_nor_chooses_its_weights(data):
     """A part that is left out is another one, and the network is the same to the bit."""
     train_runs, valid = data
     pieces, part = in_parts(train_runs, 2, SETTINGS.shortest)
-    smoother = Smoother(PRIOR, DT, (1e-3,), (0.1,), sizes_of(PRIOR, train_runs, DT, 1.0))
+    smoother = Smoother(PRIOR, DT, sigma=(1e-3,), walk=(0.1,), sizes=sizes_of(PRIOR, train_runs, DT, 1.0))
     judged = dict(unseen_runs(SETTINGS, train_runs, valid, smoother))
     assert {t.name for t in judged[0]} == {p.name for p, own in zip(pieces, part, strict=True) if own == 0}
     assert set(judged) == {0, 1}  # the validation chose the weights: it judges none

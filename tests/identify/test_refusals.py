@@ -29,7 +29,6 @@ from hybrid_mpc.identify.choose import recommend
 from hybrid_mpc.identify.delay import delayed
 from hybrid_mpc.identify.evaluate import output_errors
 from hybrid_mpc.identify.objectives import objectives_of
-from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import MAX_SUBSTEPS, required_substeps, substeps_for
 from hybrid_mpc.identify.step import TrainedParameters, shift_to
 from hybrid_mpc.identify.tune import parsed_space
@@ -103,7 +102,6 @@ REFUSED = {
     "two samples": ("017", lambda: fit(runs=[RUN.part(slice(2))])),
     "a state that no output sees": ("019", lambda: fit(Odometer)),
     "a prior that diverges": ("049", lambda: fit(Running)),
-    "a fit without a smoother": ("045", lambda: PriorFit(TRUTH, {}, (), ()).smoother(Pendulum(), DT)),
     "a prior too stiff for its period": ("049", lambda: required_substeps(stiff(1e3), 1.01e-3 * MAX_SUBSTEPS)),
     "a step of a stiff prior": ("049", lambda: PriorStep(stiff(1e3), 1.0)),
     "rates that are no number": (

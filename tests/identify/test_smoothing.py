@@ -35,7 +35,7 @@ def unknown(phi, v):
 
 
 def smoother_of(prior, runs, dt, sigma, walk):
-    return Smoother(prior, dt, sigma, walk, sizes_of(prior, runs, dt, 1.0))
+    return Smoother(prior, dt, sigma=sigma, walk=walk, sizes=sizes_of(prior, runs, dt, 1.0))
 
 
 def rms(values):
@@ -192,7 +192,7 @@ def test_a_linear_machine_is_smoothed_as_by_least_squares_over_all_samples(missi
     elif missing == "a stretch":
         run.y[20:40] = np.nan
     sizes = Sizes((1.0, 1.0), (0.01, 0.02), (2.0, 2.0, 3.0, 3.0), (1.0, 1.0, 2.0, 2.0))
-    smoother = Smoother(Masses(), dt, sigma, walk, sizes)
+    smoother = Smoother(Masses(), dt, sigma=sigma, walk=walk, sizes=sizes)
     ours = smoother.smooth([run])[0]
     first = np.concatenate([smoother._starts([run])[0], np.zeros(2)])
     spread = ignorance(smoother)
@@ -210,7 +210,7 @@ def test_the_likelihood_is_that_of_the_joint_gaussian():
     run = linear_recording(n, dt)
     run.y[4, 0] = run.y[7] = np.nan
     sizes = Sizes((1.0, 1.0), (0.01, 0.02), (2.0, 2.0, 3.0, 3.0), (1.0, 1.0, 2.0, 2.0))
-    smoother = Smoother(Masses(), dt, sigma, walk, sizes)
+    smoother = Smoother(Masses(), dt, sigma=sigma, walk=walk, sizes=sizes)
     a, b, c, e = discrete(dt)
     first = np.concatenate([smoother._starts([run])[0], np.zeros(2)])
     held, spread = np.hstack([run.u, run.w]), ignorance(smoother)
@@ -329,7 +329,8 @@ def test_where_the_first_input_holds_nothing_the_start_is_at_rest():
     upright = mass._held(np.array([np.pi, 0.0]), np.zeros((1, 1)), np.zeros((1, 0)))
     assert upright[0].tolist() == [np.pi, 0.0]  # an equilibrium, not a stable one
     run = replace(record(5), u=np.full((len(record(5).t), 1), 9.0))
-    drive = Smoother(Drive(), 0.02, (1e-3,), (0.1, 0.1), Sizes((1.0,), (1e-3,), (1.0, 1.0), (1.0, 1.0)))
+    sizes = Sizes((1.0,), (1e-3,), (1.0, 1.0), (1.0, 1.0))
+    drive = Smoother(Drive(), 0.02, sigma=(1e-3,), walk=(0.1, 0.1), sizes=sizes)
     assert drive._held(np.ones(2), run.u[:1], run.w[:1]).tolist() == [[1.0, 1.0]]
 
 
@@ -411,7 +412,7 @@ def test_a_censored_sample_counts_where_the_estimate_contradicts_it():
     base = {"u": np.zeros((n, 1)), "y": y, "x": nothing, "xdot": nothing, "w": np.zeros((n, 0))}
     run = Censored("free", "train", DT, DT * np.arange(n), **base, censored=sign)
     sizes = Sizes((1.0,), (0.01,), (1.0, 1.0), (1.0, 1.0))
-    smoother = Smoother(Free(), DT, (0.01,), (0.5,), sizes)
+    smoother = Smoother(Free(), DT, sigma=(0.01,), walk=(0.5,), sizes=sizes)
     above, below = (smoother.smooth([replace(run, censored=k * sign)])[0].x[:30, 0] for k in (1, -1))
     # the limit holds to a few of the sensor's standard deviations; the last samples before the jump give way to it
     assert above[:-6].min() > 0.5 - 0.04

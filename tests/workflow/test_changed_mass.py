@@ -58,7 +58,7 @@ def machines(tmp_path_factory):
     (before,) = read_test(scenario, recording(folder / "before.csv", OLD, seed=0, seconds=160.0))
     (after,) = read_test(scenario, recording(folder / "after.csv", HEAVIER, seed=1, seconds=10.0))
     smoother = fit_smoother(scenario.prior(OLD), pieces(before, 10.0), 0.02)
-    known = PriorFit(OLD, {}, (), (), sigma=smoother.sigma, walk=smoother.walk, sizes=smoother.sizes)
+    known = PriorFit(OLD, {}, (), (), **smoother.smoother_settings)
     return before, after, known
 
 

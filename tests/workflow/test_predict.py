@@ -12,7 +12,9 @@ import pytest
 from patience import HANGS
 
 from hybrid_mpc import InputError, load, load_trajectories, predict
+from hybrid_mpc.files import write_json
 from hybrid_mpc.kit.parts import read_description, write_description
+from hybrid_mpc.workflow.predict import read_predictions
 from hybrid_mpc.workflow.stages.results import read_results
 
 
@@ -92,6 +94,8 @@ def test_the_command_writes_tables_figures_and_numbers(call, bare_tanks, model, 
         f"{name}.{end}" for name in ("later", "monday") for end in ("csv", "png")
     } | {"predict.json"}
     found = json.loads((out / "predict.json").read_text())
+    write_json(tmp_path / "again.json", read_predictions(out / "predict.json"))
+    assert json.loads((tmp_path / "again.json").read_text()) == found
     kit = load(model)
     assert found["model"] == kit.recommended
     rows = list(csv.DictReader((out / "later.csv").open()))

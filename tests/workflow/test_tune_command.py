@@ -11,13 +11,13 @@ from typer.testing import CliRunner
 
 from hybrid_mpc import InputError, RunSettings, SearchSpace, load_scenario
 from hybrid_mpc.cli.main import app
-from hybrid_mpc.files import LOCK
+from hybrid_mpc.files import LOCK, write_json
 from hybrid_mpc.folder import JobNote, open_folder
 from hybrid_mpc.identify.tune import parsed_space
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.settings import read_network
 from hybrid_mpc.workflow.stages.identify import training_settings
-from hybrid_mpc.workflow.tune import TuneSettings, usage
+from hybrid_mpc.workflow.tune import TuneSettings, read_tuning, usage
 
 PNG = b"\x89PNG"
 
@@ -36,6 +36,14 @@ def searched(words, tmp_path_factory):
     done = CliRunner().invoke(app, [*map(str, words), "--trials", "2", "--out", str(out)])
     assert done.exit_code == 0, done.output
     return out
+
+
+@pytest.mark.full
+def test_results_are_read_and_written_back(searched, tmp_path):
+    results = read_tuning(searched / "results.json")
+    write_json(tmp_path / "again.json", results)
+    assert (tmp_path / "again.json").read_text() == (searched / "results.json").read_text()
+    assert (results.base_settings.kind, isinstance(results.best.values["hidden"], int)) == ("mopgrnn", True)
 
 
 def trials(results):

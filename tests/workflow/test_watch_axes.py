@@ -19,6 +19,7 @@ from hybrid_mpc import (
     write_csv,
 )
 from hybrid_mpc.cli.main import app
+from hybrid_mpc.data.scales import Sizes
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.kit.parts import write_watch
 from hybrid_mpc.workflow.context import Context
@@ -111,7 +112,8 @@ def context(machine, samples, out, warm_up):
     made.keep(NOISE, {}, NoiseResult(found))
     train = made.trajectories("train")
     states = {f"{t.name}/{key}": getattr(t, key) for t in train for key in ("x", "xdot")}
-    made.keep(PRIOR, {}, PriorResult(PriorFit({}, {}, (), ()), {}, {}, {}, (), (), {}, "", {}, None, states))
+    fit = PriorFit({}, {}, (), (), sigma=(), walk=(), sizes=Sizes((), (), (), ()))
+    made.keep(PRIOR, {}, PriorResult(fit, {}, {}, {}, (), (), {}, "", {}, None, states))
     return made
 
 

@@ -99,7 +99,6 @@ def choice_stage(context: Context) -> ChoiceResult:
 
 def run_parts(phy: Prior, fit: PriorFit, every: Sequence[Sequence[FreeRun]], dt: float) -> list[RunParts]:
     """Errors of each run of a model, and the parts of their variance; ``every``: its runs, then each network's."""
-    assert fit.sizes is not None
     spread, parameters = np.array(fit.sizes.y), by_parameters(phy, fit, every[0], dt)
     found = []
     for i, runs in enumerate(zip(*every, strict=True)):

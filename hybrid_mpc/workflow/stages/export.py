@@ -123,22 +123,16 @@ def export_stage(context: Context) -> ExportResult:
     )
 
 
-def predicting(context: Context, phy: Prior) -> Predicting | None:
-    """Settings that predictions need besides the models; None without a smoother."""
+def predicting(context: Context, phy: Prior) -> Predicting:
+    """Settings that predictions need besides the models."""
     fit, chosen = context.prior.fit, context.read(CHOICE)
-    if fit.sizes is None:
-        return None
     bands = {name: chosen.bands[key] for name, key in (("prior", "phy"), ("hybrid", chosen.deployed))}
     return Predicting(
         data=replace(context.spec, windows={}, free_run=context.prior.longest_run),
         corrects=tuple(phy.states[i].name for i in phy.corrected),
-        sigma=fit.sigma,
-        walk=fit.walk,
-        sizes=fit.sizes,
-        fading=fit.fading,
-        substeps=fit.substeps,
         bands=bands,
         longest=chosen.longest,
+        **fit.smoother_settings,
     )
 
 

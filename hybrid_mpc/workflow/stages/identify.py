@@ -123,10 +123,10 @@ class BaselineScores:
 
 @dataclass(frozen=True)
 class PriorResult:
-    """The fitted prior, and the states that its equations smooth the recordings to.
+    """The fitted prior, and the states of the recordings that its smoother estimates.
 
     Args:
-        fit: Parameters with their standard errors, the inputs' delay, and what the smoother assumes.
+        fit: Parameters with their standard errors, the inputs' delay, and the smoother's settings.
         nominal: Parameters before the fit.
         units: Units of the parameters.
         baselines: Errors on the test recordings of simpler models, by name: ``"constant"`` (the training mean) and
@@ -136,11 +136,11 @@ class PriorResult:
         errors: Errors on the test recordings of the prior with nominal (``"phy_nominal"``) and fitted (``"phy"``)
             parameters.
         no_gain: Why later stages must not use this fit: a constant or the nominal parameters are better. Empty if they
-            may.
+            may use it.
         error_correlation: Correlation of successive one-step errors of the smoother, by output; zero is white.
-        longest_run: Length [s] of the free runs that models are judged by; None: whole recordings.
+        longest_run: Length [s] of the free runs that evaluate models; None: whole recordings.
         arrays: States and their rates, ``"TRAJECTORY/x"`` and ``"TRAJECTORY/xdot"`` ``(n, n_x)``.
-        lacking: Those of ``in_doubt`` that a missing term can explain: bounds, better simpler models, a poor FIT.
+        lacking: The reasons in ``in_doubt`` that a missing term can explain: bounds, better simpler models, a poor FIT.
     """
 
     fit: PriorFit
@@ -601,8 +601,8 @@ def runs_of(
 ) -> list[list[FreeRun]]:  # fmt: skip
     """Free runs of one model, then of each of its networks if it has several.
 
-    The model is the mean of its networks; with ``own`` it is network ``own`` alone, the only network that did not train
-    on these trajectories. The networks' correction is multiplied by ``share``.
+    The model is the mean of its networks. With ``own``, the model is network ``own`` alone, the only network that did
+    not train on these trajectories. The networks' correction is multiplied by ``share``.
     """
     dt, warm = context.spec.dt, context.warm
     if name in ("phy_nominal", "phy"):
@@ -634,7 +634,7 @@ def training_settings(context: Context, kind: str) -> TrainingSettings:
 
 
 def _as_long_as_judged(context: Context, kind: str) -> TrainingSettings:
-    """Training settings whose free runs are no longer than those that compare the models of an unstable machine."""
+    """Training settings; for an unstable machine, free runs are at most as long as those that compare the models."""
     settings, longest = training_settings(context, kind), context.prior.longest_run
     if context.spec.free_run is not None or longest is None:
         return settings
