@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -62,11 +64,11 @@ def explain(
     console.print(_steps(found))
     if found.tests:
         console.print(_tests(found))
-    print_summary(summary(found, folder), folder / PAGE, "page")
+    print_summary(summary(found, folder, settings.data), folder / PAGE, "page")
 
 
-def summary(found: ExplainResult, folder: Path) -> list[str]:
-    """The result in a few lines."""
+def summary(found: ExplainResult, folder: Path, data: Sequence[Path] = ()) -> list[str]:
+    """The result in a few lines, with the next command for these recordings."""
     from hybrid_mpc.identify.explain import FEWEST
     from hybrid_mpc.workflow.explain_page import FEW
 
@@ -86,6 +88,16 @@ def summary(found: ExplainResult, folder: Path) -> list[str]:
         *lines,
         f"end of the search: {explanation.reason}",
         f"scenario: {(folder / found.file).resolve()}",
+        "next: "
+        + shlex.join(
+            [
+                "hybrid-mpc",
+                "check",
+                str(folder / found.file),
+                *(v for file in data for v in ("--data", str(file))),
+                "--fit",
+            ]
+        ),
     ]
 
 

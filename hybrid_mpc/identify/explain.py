@@ -545,6 +545,7 @@ class _Fitted:
     sure: bool = False
     worse: bool = False
     short: HeldOutError | None = None
+    needed: Terms = ()
 
 
 @dataclass(frozen=True)
@@ -702,11 +703,17 @@ class _Explain:
         singles, pairs, diverged = self._scored(number)
         fitted = list(self._fitted(singles.best(TRIED), f"step {number}"))
         chosen = self._chosen(fitted)
+        both: list[_Fitted] = []
         if chosen is None:
             some = pairs.best(PAIRS, singles)
-            both = list(self._fitted(some, f"step {number}, pairs"))
+            both = [self._as_needed(one) for one in self._fitted(some, f"step {number}, pairs")]
             fitted += both
-            chosen = self._chosen([one for one in both if self._both_needed(one)])
+            chosen = self._chosen(both)
+        if chosen is None:  # of a pair with one needless term, the other one may pass alone
+            tried = {one.forms for one in fitted}
+            halves = list(dict.fromkeys(one.needed for one in both if one.needed and one.needed not in tried))
+            fitted += (more := list(self._fitted(halves, f"step {number}, terms of pairs")))
+            chosen = self._chosen(more)
         trials = [self._trial(one, chosen) for one in fitted] + diverged
         return tuple(trials), len(self.pool), chosen
 
@@ -826,10 +833,10 @@ class _Explain:
         near = [one for one in sure if ratios[id(one)] <= 1.0 / ADDED]
         return min(near, key=lambda one: (_free(one.forms), ratios[id(one)]))
 
-    def _both_needed(self, pair: _Fitted) -> bool:
-        """Whether each term of a pair reduces the error in addition to the other."""
+    def _as_needed(self, pair: _Fitted) -> _Fitted:
+        """A pair, which is refused if one of its terms does not reduce the error in addition to the other."""
         if not pair.sure:
-            return False
+            return pair
         terms = (*self.now.terms, *pair.forms)
         for form in pair.forms:
             kept, theta = self.search.without(terms, pair.theta, form)
@@ -838,8 +845,9 @@ class _Explain:
             except (InputError, np.linalg.LinAlgError):
                 continue  # without this term the model cannot be simulated in every fold
             if self.evidence.compared(pair.squares, alone, 1).ratio >= WORTH:
-                return False
-        return True
+                needed = tuple(one for one in pair.forms if one is not form)
+                return replace(pair, sure=False, reason=f"{form.name} is not needed", needed=needed)
+        return pair
 
     def _trial(self, one: _Fitted, chosen: _Fitted | None) -> Trial:
         outcome: Outcome = "worse"
@@ -952,9 +960,7 @@ def _reason(trials: Sequence[Trial], pieces: int) -> str:
     if not judged:
         return "no further candidate lowers the error in a Gauss-Newton step"
     best = min(judged, key=lambda trial: trial.held_out.ratio if trial.held_out else math.inf)
-    return (
-        f"{best.name}: {best.reason}" if best.reason else f"{best.name}: one of the two terms is not needed"
-    )
+    return f"{best.name}: {best.reason}"
 
 
 def _found(term: Term) -> FoundTerm:

@@ -72,6 +72,9 @@ class _Library:
 
     def __init__(self, prior: Prior, points: Points, dt: float, length: float) -> None:
         self.prior, self.dt, self.length = prior, dt, length
+        self.own = len(
+            getattr(type(prior), "base", type(prior)).states
+        )  # a law acts on no state of another term
         self.x, self.u, self.w = points
         rates = prior.equations.xdot(self.x.T, self.u.T, self.w.T, prior.p).full().T
         self.rates = self.accelerations = np.sqrt(np.mean(np.square(rates), axis=0))
@@ -92,7 +95,7 @@ class _Library:
     def candidates(self) -> Iterator[Term | Candidate]:
         """All candidates; a term alone is one of a single form."""
         exact = set(self.positions.values())
-        for i, state in enumerate(self.prior.states):
+        for i, state in enumerate(self.prior.states[: self.own]):
             if i in self.positions:
                 yield from self._axis(i, state)
             elif i not in exact and i in self.prior.corrected:
@@ -298,7 +301,7 @@ class _Library:
 
     def _signals(self) -> Iterator[tuple[Signal, Array]]:
         for group, values in (
-            (self.prior.states, self.x),
+            (self.prior.states[: self.own], self.x[:, : self.own]),
             (self.prior.inputs, self.u),
             (self.prior.disturbances, self.w),
         ):

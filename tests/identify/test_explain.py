@@ -249,7 +249,45 @@ def test_a_pair_is_needed_where_the_model_without_a_term_cannot_be_simulated(fai
     search = SimpleNamespace(without=lambda terms, theta, form: (terms, theta), held_out=fail)
     own = SimpleNamespace(search=search, now=SimpleNamespace(terms=()), evidence=None)
     pair = SimpleNamespace(sure=True, forms=("one", "other"), theta=np.zeros(2))
-    assert _Explain._both_needed(own, pair)
+    assert _Explain._as_needed(own, pair) is pair
+
+
+def test_of_a_pair_with_a_needless_term_the_other_one_is_tried_alone():
+    """One step: the pair passes, but without its first term the error is the same."""
+    needless = terms.input_gain("torque", Parameter("g", 0.0, "-", -0.5, 0.5))
+    needed = terms.coulomb("phi_dot", Parameter("F", 0.0, "N m", 0.0, 1.0), width=0.05)
+    error = HeldOutError(0.1, 0.7, 0.6, 0.8, 0.0)
+    pair = _Fitted((needless, needed), error, np.zeros(2), np.array([0.7]), sure=True)
+    alone = _Fitted((needed,), error, np.zeros(1), np.array([0.7]), sure=True)
+    ranked = SimpleNamespace(best=lambda count, beyond=None: [] if beyond is None else [pair.forms])
+    search = SimpleNamespace(
+        without=lambda terms, theta, form: (form, theta),
+        held_out=lambda by, kept, theta: np.array([0.7 if kept is needless else 1.0]),
+    )
+    own = SimpleNamespace(
+        steps=[], pool=[], search=search, now=SimpleNamespace(terms=()),
+        evidence=SimpleNamespace(compared=lambda a, b, n: replace(error, ratio=float(a[0] / b[0]))),
+        _scored=lambda number: (SimpleNamespace(best=lambda count: []), ranked, []),
+        _fitted=lambda some, text: [pair if len(forms) == 2 else alone for forms in some],
+        _trial=lambda one, chosen: one,
+    )  # fmt: skip
+    own._as_needed = lambda one: _Explain._as_needed(own, one)
+    own._chosen = lambda fitted: next((one for one in fitted if one.sure), None)
+    trials, _, chosen = _Explain._step(own)
+    assert chosen is alone
+    assert [one.reason for one in trials] == ["gain of torque is not needed", ""]
+
+
+def test_no_law_acts_on_the_state_of_a_term_that_is_there():
+    lag = terms.input_lag(
+        "torque", Parameter("t", 0.1, "s", 0.01, 1.0), state=Signal("late", "N m", -9.0, 9.0)
+    )
+    lagged, rng = extended(Pendulum, lag), np.random.default_rng(0)
+    points = rng.standard_normal((50, 3)), rng.standard_normal((50, 1)), np.zeros((50, 0))
+    forms = [form for one in library(lagged(), points, 0.02, 4.0) for form in one.forms]
+    assert not {form.of for form in forms} & {"late"}
+    for form in forms:
+        assert len(extended(lagged, form).parameters) > len(lagged.parameters)
 
 
 def test_an_own_term_may_have_parameters_that_are_not_zero():

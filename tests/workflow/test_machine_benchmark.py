@@ -3,12 +3,14 @@
 import shutil
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from cart import DELAY, TRUE, recording, written
 
 from hybrid_mpc import BenchmarkBudget, BenchmarkSpec, InputError, Signal, fit_prior, load, load_scenario
+from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.files import read_document, write_document
 from hybrid_mpc.identify.dataset import cut_windows
 from hybrid_mpc.identify.delay import shifted
@@ -18,6 +20,7 @@ from hybrid_mpc.workflow.benchmark import BenchmarkContext, BenchmarkSettings, b
 from hybrid_mpc.workflow.benchmark_runs import BenchmarkRun, read_test, read_training, run_error, run_freely
 from hybrid_mpc.workflow.predict import read_recordings_of
 from hybrid_mpc.workflow.settings import RunSettings
+from hybrid_mpc.workflow.stages import identify
 from hybrid_mpc.workflow.stages.identify import trained_models, training_settings
 
 
@@ -322,3 +325,17 @@ def test_a_scheduler_s_workers_examine_the_fit_and_train_the_networks(machine, t
         benchmark(BenchmarkSettings(str(scenario), (train,), (test,)), tmp_path, cluster="tcp://127.0.0.1:9")
     address = "tcp://127.0.0.1:9"
     assert asked == [(["recordings", "wrong terms"], address), (["mopgrnn", "pgrnn", "rnn"], address)]
+
+
+def test_linear_models_of_runs_over_acting_inputs_are_fitted_to_them(monkeypatch):
+    """With a fitted delay, models of the commanded inputs would be judged by other inputs than they know."""
+    n, seen = 20, []
+    u = np.arange(n, dtype=float)[:, None]
+    run = Trajectory("run", "train", 0.1, 0.1 * np.arange(n), u, u, u, u, np.zeros((n, 0)))
+    monkeypatch.setitem(identify.BASELINES, "ARX", lambda train, valid, dt, warm: seen.append(train[0].u))
+    monkeypatch.delitem(identify.BASELINES, "N4SID")
+    context = SimpleNamespace(trajectories=lambda role: [run], spec=SimpleNamespace(dt=0.1), warm=3)
+    identify.linear_models(context)
+    identify.linear_models(context, 0.2)
+    np.testing.assert_array_equal(seen[0], u)
+    np.testing.assert_array_equal(seen[1], u[:-2])

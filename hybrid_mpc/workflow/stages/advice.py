@@ -172,7 +172,8 @@ def _floor(results: Results, declared: Sequence[float]) -> Iterator[Hint]:
         if error < FLOOR * min(noise, own):
             yield Hint(
                 "good", f"{said}noise as estimated by the fit.",
-                "With these recordings, no better model is possible. Use a better sensor, or excite the machine more.",
+                f"With these recordings, no better model of {name} is possible. Use a better sensor, or excite the "
+                "machine more.",
             )  # fmt: skip
         else:
             yield Hint(

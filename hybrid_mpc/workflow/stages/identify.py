@@ -316,10 +316,12 @@ def examined_prior(context: Context) -> PriorResult:
     bounds = bound_costs(make, fit, every[: len(train)], spec.dt, trial)
     ranges = *beyond_ranges(fitted, every), *warn_of_drift(fitted, max(10 * spec.dt, spec.warm_up))
     fit = replace(fit, warnings=(*fit.warnings, *(str(one) for one in bounds if one.costs), *ranges))
+    if fit.delay:
+        context.progress.note(f"fitted delay of the inputs: {fit.delay:.3g} s")
     for warning in fit.warnings:
         context.progress.warn(f"fit of the prior: {warning}")
     unseen = every[len(train) + len(valid) :]
-    judge, linear = _Judge(context, fitted, fit, smoother), linear_models(context)
+    judge, linear = _Judge(context, fitted, fit, smoother), linear_models(context, fit.delay)
     length_of_runs = run_length(
         make, fit, every[: len(train)], every[len(train) :], dt=spec.dt, warm=context.warm, longest=longest,
         free_run=spec.free_run,
@@ -423,9 +425,12 @@ def _error_of(baseline: BaselineScores) -> float:
     return math.inf if baseline.errors is None else baseline.errors.error
 
 
-def linear_models(context: Context) -> dict[str, LinearModel | str]:
-    """Linear input-output models by name, or why the model is missing."""
-    train, valid = context.trajectories("train"), context.trajectories("valid")
+def linear_models(context: Context, delay: float = 0.0) -> dict[str, LinearModel | str]:
+    """Linear input-output models by name, or why the model is missing.
+
+    With a ``delay`` [s] they are models of the inputs that act, for runs over these.
+    """
+    train, valid = (shifted(context.trajectories(role), delay) for role in ("train", "valid"))
     found: dict[str, LinearModel | str] = {}
     for name, fit_linear in BASELINES.items():
         try:

@@ -372,6 +372,7 @@ def _prior_table(context: Context) -> Table:
     caption = (
         "Parameters of the prior. Standard errors assume that the prior's structure is right. Correlation of "
         f"successive one-step errors (0 is white): {colours}."
+        + (f" Fitted delay of the inputs: {prior.fit.delay:.3g} s." if prior.fit.delay else "")
     )
     return Table(("parameter", "meaning", "nominal", "fitted", "standard error"), rows, caption)
 
