@@ -71,5 +71,5 @@ def c(
         kit.blended() if blended else kit, out, model=name, task=task, tracking=track or blended, single=single,
         monitor=monitor, guard=reaction, check=check,
     )  # fmt: skip
-    said = "compiled and tested; README.md has the sizes" if check else "not compiled or run"
-    print(f"C in {folder.resolve()}; {said}. Next: make -C {shlex.quote(str(folder))} test")
+    again = f"not compiled or run. Next: make -C {shlex.quote(str(folder))} test"
+    print(f"C in {folder.resolve()}; {'compiled and tested; README.md has the sizes' if check else again}")

@@ -689,19 +689,20 @@ def no_offset(point: SetPoint, trials: Sequence[Trial], several: bool = False) -
             name, "not promised", f"the cost is economic, so its optimum may have an offset; {within}",
             "To hold a set-point, weight the outputs (q_y) and omit the economic cost.",
         )  # fmt: skip
-    lacks = []
+    lacks, remedies = [], []
     if len(point.held) > point.model.n_u:
+        remedies.append("Weight at most as many outputs as there are inputs.")
         names = ", ".join(point.model.outputs[i].name for i in point.held)
         lacks.append(
             f"{counted(len(point.held), 'output')} ({names}) are controlled by {counted(point.model.n_u, 'input')}"
         )
     if why := ranks(point).why:
         lacks.append(why)
+        remedies.append("Declare as many observable disturbances as outputs (docs/disturbances.md).")
     if lacks:
         return Promise(
             name, "not promised", f"{'; '.join(lacks)}; {within}",
-            "Weight at most as many outputs as there are inputs, and declare as many disturbances as outputs "
-            "(docs/disturbances.md).",
+            " ".join(remedies),
         )  # fmt: skip
     if worst.why:
         return Promise(name, "doubted", within, choose_remedy(worst.why))

@@ -856,6 +856,8 @@ class _Explain:
             outcome = "added"
         elif one.held_out is None:
             outcome = "worse" if one.worse else "diverged"
+        elif chosen is not None and set(chosen.forms) < set(one.forms):
+            outcome = "worse"  # no alternative: it contains the added term
         elif chosen is not None and one.held_out.ratio < WORTH:
             between = self.evidence.compared(one.squares, chosen.squares, 1)
             outcome = "alternative" if between.lower <= 1.0 else "worse"

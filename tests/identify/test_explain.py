@@ -276,6 +276,8 @@ def test_of_a_pair_with_a_needless_term_the_other_one_is_tried_alone():
     trials, _, chosen = _Explain._step(own)
     assert chosen is alone
     assert [one.reason for one in trials] == ["gain of torque is not needed", ""]
+    told = _Explain._trial(own, trials[0], alone)
+    assert (told.outcome, told.reason) == ("worse", "gain of torque is not needed")
 
 
 def test_no_law_acts_on_the_state_of_a_term_that_is_there():
