@@ -1020,11 +1020,11 @@ class _Pictures:
         known: Sequence[Trajectory],
     ) -> None:
         self.base, self.terms, self.parameters = search.base, terms, parameters
-        columns = [np.concatenate([getattr(t, key) for t in known]) for key in ("x", "u", "w", "xdot", "y")]
-        whole = np.isfinite(np.hstack(columns[:4])).all(axis=1)
+        columns = [np.concatenate([getattr(t, key) for t in known]) for key in ("x", "u", "w", "xdot")]
+        whole = np.isfinite(np.hstack(columns)).all(axis=1)
         chosen = np.flatnonzero(whole)
         chosen = chosen[evenly(len(chosen), DRAWN)]
-        self.bare_x, self.u, self.w, self.xdot, self.y = (c[chosen] for c in columns)
+        self.bare_x, self.u, self.w, self.xdot = (c[chosen] for c in columns)
         self.x, _, _ = search.with_states(terms, (self.bare_x, self.u, self.w))
         self.values = np.array([p.value for p in parameters])
         self.prior = extended(search.base, *terms)()
@@ -1126,9 +1126,11 @@ class _Pictures:
         return self._as_force(self._rates(values) - self._rates(zero), term)
 
     def _left(self, term: Term) -> Array | None:
-        """Residual of the model at the term's place ``(n,)``; None for terms of inputs and disturbances."""
-        if term.place in ("input", "disturbance"):
+        """Residual of the rate or force at the term's place ``(n,)``; None for terms of inputs, disturbances, outputs.
+
+        The states are smoothed without the terms, so they follow a wrong sensor, and residuals of outputs do not show
+        it.
+        """
+        if term.place in ("input", "disturbance", "output"):
             return None
-        if term.place == "output":
-            return (self.y - self._shown())[:, _index(self.base, term)]
         return self._as_force(self.xdot - self._rates(self.values), term)

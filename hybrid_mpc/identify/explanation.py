@@ -154,7 +154,7 @@ class TermPicture:
         term: Value of the term at each point.
         low: Value of the term minus two standard errors of its parameters.
         high: Value of the term plus two standard errors.
-        data: Value of the term plus the residual of the model with all terms; empty if no rate or output shows it.
+        data: Value of the term plus the residual of the model with all terms; empty if no rate shows it.
     """
 
     abscissa: str

@@ -180,7 +180,7 @@ def _about_terms(explanation: Explanation) -> Sequence[str]:
     hidden = [term.name for term in explanation.found if state_of(term)]
     texts = [
         "The line is the fitted term. The points are the term plus the residual of the model with all terms, sample by "
-        "sample."
+        "sample; terms of inputs and sensors have no points."
     ]
     if hidden:
         texts.append(f"Terms with a state of their own have no curve: {', '.join(hidden)}.")

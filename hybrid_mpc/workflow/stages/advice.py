@@ -19,6 +19,8 @@ EXPLAINED = 60.0
 """FIT [%] of the fitted prior below which a network would have to learn too much."""
 HELD = (0.10, 0.07)
 """How far a band's coverage of test data may lie below and above its nominal share: 80 to 97 % for a 90 % band."""
+CLEARLY = 0.9
+"""Ratio of errors below which a simpler model is better than the recommended one; smaller differences are chance."""
 FLOOR = 1.5
 """Ratio of free-run error to sensor noise up to which sensor noise explains the error."""
 MOST = 4
@@ -150,7 +152,7 @@ def _linear(results: Results) -> Iterator[Hint]:
     own = results.evaluation.scores[chosen].model.error
     errors = {name: b.errors.error for name, b in results.prior.baselines.items() if b.errors is not None}
     name = min(errors, key=lambda n: errors[n], default="")
-    if name and math.isfinite(own) and errors[name] < own:
+    if name and math.isfinite(own) and errors[name] < CLEARLY * own:
         model = "a constant" if name == "constant" else f"the linear model {name}"
         yield Hint(
             "bad", f"On test data {model} has an error of {errors[name]:.3g}, {name_of(chosen)} {own:.3g}.",
