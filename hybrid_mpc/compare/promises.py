@@ -793,13 +793,17 @@ def _compute_left_costs(point: SetPoint) -> Array:
     return np.array(found) / found[0]
 
 
-def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Promise:
+def margins(
+    points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = (), lacking_delay: float = 0.0
+) -> Promise:
     """Row "stability margins": of the linearized loop of observer and controller at the set-points, for each input.
 
     Args:
         points: Set-points of the recommended model.
         of_prior: Set-points of the fitted prior, if another model is recommended: they show whether the network reduces
             the margin. Default: none.
+        lacking_delay: Delay of the inputs [s] that the recordings show and the prior lacks; the loop must bear a period
+            more. Default: none.
     """
     name = "stability margins"
     worst: tuple[SetPoint, Signal, Margins] | None = None
@@ -807,7 +811,8 @@ def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Pr
     for point in points:
         try:
             for signal, own in _margins_at(point):
-                good &= own.modulus >= MODULUS and own.delay_periods >= 1
+                lacking = lacking_delay / point.model.dt
+                good &= own.modulus >= MODULUS and own.delay_periods >= 1 + lacking
                 if worst is None or own.modulus < worst[2].modulus:
                     worst = point, signal, own
         except InputError as error:
@@ -820,6 +825,9 @@ def margins(points: Sequence[SetPoint], of_prior: Sequence[SetPoint] = ()) -> Pr
         f"at {signal.name} in {point.title}: gain {own.gain_down:.2g} to {own.gain_up:.3g} times, phase "
         f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay"
     )
+    if lacking_delay:
+        shown = lacking_delay / point.model.dt
+        evidence += f", of which the recordings show {lacking_delay:.2g} s ({shown:.1f}) already"
     if good:
         return Promise(name, "shown", evidence)
     evidence += f". Beyond these margins the linearized loop is unstable (recommended distance: {MODULUS:g})"
@@ -1270,7 +1278,7 @@ def examine(
     report(len(points), len(points), "margins, limits, observer")
     fails = failing_loop(points, every)
     time = step_time([one for one in own if not one.fails] or own, 1e3 * points[0].model.dt)
-    of_model = horizon(points), margins(points, _find_prior_points(kit, tasks))
+    of_model = horizon(points), margins(points, _find_prior_points(kit, tasks), lacking_delay)
     of_observer = process_noise(kit), innovations(tested)
     if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer)

@@ -334,6 +334,14 @@ def test_a_loop_with_small_margins_is_a_doubt():
     assert (stuck.verdict, "lies on a bound" in stuck.evidence) == ("not promised", True)
 
 
+def test_the_delay_that_the_recordings_show_is_part_of_the_margin():
+    point = point_of(kit_of(tank()), hold(0.0))
+    spare, dt = p._margins_at(point)[0][1].delay_periods, point.model.dt
+    within, beyond = (p.margins([point], lacking_delay=share * dt) for share in (spare - 1, spare))
+    assert (p.margins([point]).verdict, within.verdict, beyond.verdict) == ("shown", "shown", "doubted")
+    assert f"({spare - 1:.1f})" in within.evidence
+
+
 def test_inputs_that_act_as_late_as_the_recordings_show_are_a_doubt_if_the_loop_swings():
     point = point_of(kit_of(tank()))
     shown = p.late_inputs(point)
