@@ -31,6 +31,7 @@ def with_terms(
     A state of a term, e.g. of a lag, gets no weight and no bounds in the control problem. At the start of a task it has
     its steady value at the input that holds the task's first state; if no input does, that of the operating point. The
     scenario's plant and oracle, which do not have this state, are left out: loops then run on a trained model.
+    The promise "structure of the prior" lists the terms as those of a search (``explained``).
     ``first_sigma`` is left to its default: with the lag of a sensor, other states are measured directly than before.
 
     Args:

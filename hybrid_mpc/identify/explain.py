@@ -190,7 +190,7 @@ class _HeldOut:
             )
         if self.summary.recordings < FEWEST and found.ratio > GAIN:
             return (
-                f"{said}, but must be below {GAIN:g} with less than {FEWEST} recordings: add "
+                f"{said}, but must be below {GAIN:g} with fewer than {FEWEST} recordings: add "
                 f"{counted(FEWEST - self.summary.recordings, 'recording')}"
             )
         if found.error > POOR and found.ratio > GAIN:
@@ -333,7 +333,7 @@ class _Search:
             return windows.w[:, 0, k], float(np.std(self.points[2][:, k]))
         return windows.y[:, 0, k], float(self.spread[k])
 
-    def judged(
+    def evaluation(
         self, by: _HeldOut, terms: Terms, theta: Array, keep: NDArray[np.bool_] | None = None
     ) -> Shooting:
         """Shooting problem for the evaluation of the prior with terms.
@@ -379,7 +379,7 @@ class _Search:
         for fold in sorted(set(by.folds.tolist())):
             held = by.folds == fold
             fitted = self.problem(terms, by.rows(~held)).solve(theta, ITERATIONS).theta
-            squares[held] = _squares(self.judged(by, terms, fitted, held), fitted)
+            squares[held] = _squares(self.evaluation(by, terms, fitted, held), fitted)
         return squares
 
     def start(self, terms: Terms, theta: Array) -> Array:
@@ -432,7 +432,7 @@ class _Search:
 
     def error(self, terms: Terms, theta: Array, keep: NDArray[np.bool_] | None = None) -> float:
         """Mean squared error over all windows, or over those of a mask."""
-        squares = _squares(self.judged(self.evidence, terms, theta, keep), theta)
+        squares = _squares(self.evaluation(self.evidence, terms, theta, keep), theta)
         counted_ = self.evidence.counted if keep is None else self.evidence.counted[keep]
         return max(float(squares[counted_].mean()), 1e-300)
 
@@ -458,7 +458,7 @@ class _Promises:
         normals = []
         for problem, before in (
             (search.problem(joint, evidence.windows), search.problem(terms, evidence.windows)),
-            (search.judged(evidence, joint, start), search.judged(evidence, terms, theta)),
+            (search.evaluation(evidence, joint, start), search.evaluation(evidence, terms, theta)),
         ):
             x = before.first_states(theta)
             slopes, errors = problem.linear(start, x)
@@ -777,9 +777,9 @@ class _Explain:
             except (InputError, np.linalg.LinAlgError) as error:
                 yield _Fitted(forms, None, np.zeros(0), np.zeros(0), str(error))
                 continue
-            yield self._judged(forms, own.theta, squares, len(some), indistinct)
+            yield self._evaluated(forms, own.theta, squares, len(some), indistinct)
 
-    def _judged(
+    def _evaluated(
         self, forms: Terms, theta: Array, squares: Array, candidates: int, indistinct: Sequence[Term]
     ) -> _Fitted:
         if not np.isfinite(squares).all():
@@ -958,10 +958,10 @@ class _Explain:
 
 def _reason(trials: Sequence[Trial], pieces: int) -> str:
     """Reason why the search ends."""
-    judged = [trial for trial in trials if trial.held_out is not None]
-    if not judged:
+    evaluated = [trial for trial in trials if trial.held_out is not None]
+    if not evaluated:
         return "no further candidate lowers the error in a Gauss-Newton step"
-    best = min(judged, key=lambda trial: trial.held_out.ratio if trial.held_out else math.inf)
+    best = min(evaluated, key=lambda trial: trial.held_out.ratio if trial.held_out else math.inf)
     return f"{best.name}: {best.reason}"
 
 
@@ -1047,11 +1047,11 @@ class _Pictures:
         over, abscissa = self._over(term)
         order = np.argsort(over, kind="stable")
         data = self._left(term)
-        asked = () if data is None else tuple((value + data)[order].tolist())
+        shown = () if data is None else tuple((value + data)[order].tolist())
         at, drawn, low, high = (
             tuple(c[order].tolist()) for c in (over, value, value - spread, value + spread)
         )
-        return TermPicture(abscissa, self._ordinate(term), at, drawn, low, high, asked)
+        return TermPicture(abscissa, self._ordinate(term), at, drawn, low, high, shown)
 
     def _signal(self, name: str) -> tuple[Signal, Array]:
         for group, values in (

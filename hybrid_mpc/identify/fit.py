@@ -253,7 +253,7 @@ def fit_prior(
             smoother = smoother_of(chosen)
     if fit.free and first_states.kind == "free":
         from_past = refitted(
-            fit, chosen, [one.theta for _, one in candidates],
+            fit, chosen, smoother, [one.theta for _, one in candidates],
             shifted([*train, *valid], fit.delay(chosen.theta)), min(scores),
             warm=round(warm_up / dt), periods=periods, smoother_of=smoother_of,
         )  # fmt: skip

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.scales import evenly, robust_spread
 from hybrid_mpc.data.trajectories import Trajectory
+from hybrid_mpc.errors import InputError
 from hybrid_mpc.identify.identifiable import Fitted
 from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.shooting import FAR, Shooting
@@ -33,6 +34,7 @@ ratio by which the error from the warm-up must fall. Smaller gains became harm o
 def refitted(
     fit: OutputFit,
     chosen: Fitted,
+    smoother: Smoother,
     others: Sequence[Array],
     acting: Sequence[Trajectory],
     error: float,
@@ -48,6 +50,7 @@ def refitted(
     Args:
         fit: The fit.
         chosen: Its parameters.
+        smoother: The smoother around them.
         others: Further starts, e.g. the results of shorter windows.
         acting: Training and validation trajectories with the inputs that act.
         error: Error of free runs with free initial states, over the outputs' spreads.
@@ -58,7 +61,6 @@ def refitted(
     if not warm or fit.lead or most_samples(acting) < warm + 3:
         return None
     periods = min(periods, most_samples(acting) - warm - 2)
-    smoother = smoother_of(chosen)
     before = error_from_warm_up(smoother, acting, warm, periods)
     if before <= MISLED * error:
         return None
@@ -68,8 +70,11 @@ def refitted(
     moved = [robust_spread(column) for column in np.concatenate([t.x for t in known]).T]
     problem, best, least = Shooting(fit, windows, np.maximum(smoother.sizes.x, moved)), None, before / MISLED
     for start in (chosen.theta, *others):
-        found = problem.solve(start)
-        own = smoother_of(found)
+        try:
+            found = problem.solve(start)
+            own = smoother_of(found)
+        except InputError:  # too stiff for the period there
+            continue
         if (after := error_from_warm_up(own, acting, warm, periods)) < least:
             best, least = (found, own), after
     return best

@@ -455,7 +455,7 @@ def test_short_runs_may_show_what_long_ones_do_not(ratio, short, added):
         _short=lambda forms, theta: np.ones((2, 3)),
         _at_bounds=lambda forms, theta: [],
     )
-    judged = _Explain._judged(search, (), np.zeros(1), 0.5 * np.ones((2, 3)), 10, [])
+    judged = _Explain._evaluated(search, (), np.zeros(1), 0.5 * np.ones((2, 3)), 10, [])
     assert judged.sure == bool(added)
     assert judged.short == (None if ratio > 0.95 else brief)
 

@@ -88,10 +88,34 @@ def test_the_second_fit_must_halve_a_large_error(good, monkeypatch, errors, used
     smoother = own.smoother(Tanks(own.values), DT)
     fit = OutputFit(Tanks, DT)
     chosen = Fitted(fit.scaled(own.values), np.zeros((0, 0)), ())
-    found = refitted(fit, chosen, [], runs, 0.1, warm=5, periods=50, smoother_of=lambda found: smoother)
+    found = refitted(
+        fit, chosen, smoother, [], runs, 0.1, warm=5, periods=50, smoother_of=lambda found: smoother
+    )
     assert (found is not None) == used
-    nothing = refitted(fit, chosen, [], runs, 0.1, warm=0, periods=50, smoother_of=lambda found: smoother)
+    nothing = refitted(
+        fit, chosen, smoother, [], runs, 0.1, warm=0, periods=50, smoother_of=lambda found: smoother
+    )
     assert nothing is None
+
+
+def test_a_start_that_is_too_stiff_is_left_out(good, monkeypatch):
+    runs, own = good
+    smoother, fit = own.smoother(Tanks(own.values), DT), OutputFit(Tanks, DT)
+    chosen = Fitted(fit.scaled(own.values), np.zeros((0, 0)), ())
+    given = iter((0.5, 0.2))
+    monkeypatch.setattr(warm_up, "error_from_warm_up", lambda *rest: next(given))
+    tried = []
+
+    def smoother_of(found):
+        tried.append(found)
+        if len(tried) == 1:
+            raise hm.InputError("too stiff")
+        return smoother
+
+    found = refitted(
+        fit, chosen, smoother, [fit.nominal], runs, 0.1, warm=5, periods=50, smoother_of=smoother_of
+    )
+    assert found == (tried[1], smoother)
 
 
 def test_the_stage_from_the_warm_up_is_the_result():
