@@ -69,7 +69,7 @@ def explain(
 
 def summary(found: ExplainResult, folder: Path, data: Sequence[Path] = ()) -> list[str]:
     """The result in a few lines, with the next command for these recordings."""
-    from hybrid_mpc.identify.explain import FEWEST
+    from hybrid_mpc.identify.evidence import FEWEST
     from hybrid_mpc.workflow.explain_page import FEW
 
     explanation = found.explanation

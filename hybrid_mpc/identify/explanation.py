@@ -304,15 +304,7 @@ class Explanation:
         Raises:
             InputError: If a term without a call is not among ``own``.
         """
-        given, made = {term.name: term for term in own}, []
-        for term in self.found:
-            if term.made is None and term.name not in given:
-                raise InputError(
-                    f"term {term.name!r}: only its own code can create it; call explanation.terms([term])"
-                    " [HM-IDENTIFY-015]"
-                )
-            made.append(given[term.name] if term.made is None else again(term.made))
-        return tuple(made)
+        return terms_of(self.found, own)
 
     def prior(self, base: type[Prior], own: Sequence[Term] = ()) -> type[Prior]:
         """Create the prior's class with the terms; ``prior(base)(explanation.values)`` has the fitted values.
@@ -326,3 +318,20 @@ class Explanation:
 
 def _named(terms: Sequence[FoundTerm]) -> str:
     return " and ".join(term.name for term in terms)
+
+
+def terms_of(found: Sequence[FoundTerm], own: Sequence[Term] = ()) -> tuple[Term, ...]:
+    """Create terms from their data; ``own`` are those that only a user's code can create.
+
+    Raises:
+        InputError: If a term without a call is not among ``own``.
+    """
+    given, made = {term.name: term for term in own}, []
+    for term in found:
+        if term.made is None and term.name not in given:
+            raise InputError(
+                f"term {term.name!r}: only its own code can create it; call explanation.terms([term]) "
+                "[HM-IDENTIFY-015]"
+            )
+        made.append(given[term.name] if term.made is None else again(term.made))
+    return tuple(made)

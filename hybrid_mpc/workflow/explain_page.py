@@ -6,8 +6,9 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from hybrid_mpc.identify.explain import ADDED, DOUBT, FEWEST, GAIN, POOR, WORTH
+from hybrid_mpc.identify.evidence import ADDED, DOUBT, FEWEST, GAIN, POOR
 from hybrid_mpc.identify.explanation import ExplainStep, Explanation, Trial
+from hybrid_mpc.identify.term_fits import WORTH
 from hybrid_mpc.plots import explain as plots
 from hybrid_mpc.plots.style import save
 from hybrid_mpc.report.page import Hint, KeyFigure, Report, Section, Table, write_report

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybrid_mpc.data.scales import time_unit
-from hybrid_mpc.data.trajectories import Dataset
+from hybrid_mpc.data.trajectories import Dataset, Trajectory
+from hybrid_mpc.engine import Engine, Lost, make_engine
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.files import digest, read_document, write_document
 from hybrid_mpc.folder import versions
@@ -23,11 +26,12 @@ from hybrid_mpc.identify.prior_model import prior_programs
 from hybrid_mpc.identify.prior_result import PriorFit
 from hybrid_mpc.identify.simulation import Points, required_substeps, visited
 from hybrid_mpc.identify.smooth import fit_smoother
+from hybrid_mpc.identify.term_fits import Answer, TermFits, Work
 from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.terms import EXPLANATIONS, Term, extended
 from hybrid_mpc.records import known, plain, record
-from hybrid_mpc.scenario import Scenario
+from hybrid_mpc.scenario import Scenario, load_scenario
 from hybrid_mpc.workflow.context import Context
 from hybrid_mpc.workflow.explained import ExplainResult, FreeRuns, explained_name
 from hybrid_mpc.workflow.stage import sources
@@ -217,11 +221,14 @@ class Search:
             if _added(explanation) < self.most:
                 progress.start(f"search, step {1 + _added(explanation)}")
 
-        found = search(
-            self.make, fit.values, known_, dt=self.dt, length=length, warm_up=self.context.spec.warm_up,
-            candidates=candidates, own=self.chosen.own, begun=begun, most=self.most,
-            on_progress=self._progress("candidates"), on_step=keep,
-        )  # fmt: skip
+        warm_up = self.context.spec.warm_up
+        to_fit = _ToFit(self.key, self.context.scenario_path, fit.values, known_, self.dt, length, warm_up)
+        with closing(make_engine(_answered, self.context.workers, self.context.cluster)) as engine:
+            found = search(
+                self.make, fit.values, known_, dt=self.dt, length=length, warm_up=warm_up, candidates=candidates,
+                own=self.chosen.own, begun=begun, most=self.most, on_progress=self._progress("candidates"),
+                on_step=keep, answers=partial(_answers, engine, to_fit),
+            )  # fmt: skip
         progress.finish(found.reason)
         self._keep("ended", {"found": found, "most": self.most})
         return found
@@ -285,6 +292,56 @@ class Search:
 
     def _keep(self, name: str, value: object) -> None:
         write_document(self._path(name), {"key": self.key, "value": plain(value)})
+
+
+@dataclass(frozen=True)
+class _ToFit:
+    """What another process needs to fit terms; equal if ``key`` is."""
+
+    key: str
+    scenario: str
+    values: dict[str, float] = field(compare=False)
+    known: list[Trajectory] = field(compare=False)
+    dt: float = field(compare=False)
+    length: float
+    warm_up: float = field(compare=False)
+
+
+@lru_cache(maxsize=1)
+def _fits(to_fit: _ToFit) -> TermFits:
+    """Windows and fits of the last search, so that a process cuts and compiles once."""
+    scenario = load_scenario(to_fit.scenario)
+    return TermFits(
+        prior_class(scenario), to_fit.values, to_fit.known, to_fit.dt, to_fit.length, to_fit.warm_up,
+        chosen_terms(scenario).own,
+    )  # fmt: skip
+
+
+def _answered(batch: tuple[int, _ToFit, Work]) -> Answer:
+    return _fits(batch[1]).answer(batch[2])
+
+
+def _answers(
+    engine: Engine[tuple[int, _ToFit, Work], Answer], to_fit: _ToFit, works: Sequence[Work]
+) -> Iterator[tuple[int, Answer]]:
+    """Index and answer of each candidate, as processes finish them.
+
+    Raises:
+        RuntimeError: If a process ends before its answer.
+    """
+    for i, work in enumerate(works):
+        engine.submit((i, to_fit, work))
+    left = len(works)
+    while left:
+        # time [s] between checks whether a cluster still has workers
+        found = engine.next(timeout=1.0)
+        if found is None:
+            continue
+        (i, _, _), answer = found
+        if isinstance(answer, Lost):
+            raise RuntimeError(f"the process of a candidate ended: {answer}")
+        left -= 1
+        yield i, answer
 
 
 def _added(explanation: Explanation | None) -> int:

@@ -1,6 +1,7 @@
 """The search for missing terms: a term that was taken out is found, and none is added where none is missing."""
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,10 +22,12 @@ from hybrid_mpc import (
 )
 from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.identify import term_table
-from hybrid_mpc.identify.explain import _Explain, _Fitted, _HeldOut, explain
+from hybrid_mpc.identify.evidence import HeldOut
+from hybrid_mpc.identify.explain import _Explain, explain
 from hybrid_mpc.identify.explanation import Evidence, Explanation, HeldOutError, Trial
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.simulation import Simulation, visited
+from hybrid_mpc.identify.term_fits import FittedCandidate, Present, TermFits
 from hybrid_mpc.identify.term_library import Candidate, library
 from hybrid_mpc.machine import terms
 from hybrid_mpc.machine.terms import At, Term, extended
@@ -257,8 +260,8 @@ def test_of_a_pair_with_a_needless_term_the_other_one_is_tried_alone():
     needless = terms.input_gain("torque", Parameter("g", 0.0, "-", -0.5, 0.5))
     needed = terms.coulomb("phi_dot", Parameter("F", 0.0, "N m", 0.0, 1.0), width=0.05)
     error = HeldOutError(0.1, 0.7, 0.6, 0.8, 0.0)
-    pair = _Fitted((needless, needed), error, np.zeros(2), np.array([0.7]), sure=True)
-    alone = _Fitted((needed,), error, np.zeros(1), np.array([0.7]), sure=True)
+    pair = FittedCandidate((needless, needed), error, np.zeros(2), np.array([0.7]), sure=True)
+    alone = FittedCandidate((needed,), error, np.zeros(1), np.array([0.7]), sure=True)
     ranked = SimpleNamespace(best=lambda count, beyond=None: [] if beyond is None else [pair.forms])
     search = SimpleNamespace(
         without=lambda terms, theta, form: (form, theta),
@@ -436,9 +439,7 @@ def test_products_need_several_recordings():
 def test_a_few_recordings_must_show_more(recordings, ratio, added):
     summary = SimpleNamespace(recordings=recordings)
     found = HeldOutError(error=0.1, ratio=ratio, lower=0.5, upper=0.95, harm=0.0)
-    doubt = _HeldOut.doubt(
-        SimpleNamespace(summary=summary), found, 0.5 * np.ones((2, 3)), np.ones((2, 3)), 10
-    )
+    doubt = HeldOut.doubt(SimpleNamespace(summary=summary), found, 0.5 * np.ones((2, 3)), np.ones((2, 3)), 10)
     assert (not doubt) == bool(added)
 
 
@@ -451,11 +452,11 @@ def test_short_runs_may_show_what_long_ones_do_not(ratio, short, added):
     search = SimpleNamespace(
         evidence=evidence,
         short=SimpleNamespace(compared=lambda *squares: brief, doubt=lambda *squares: short),
-        now=SimpleNamespace(squares=np.ones((2, 3)), terms=(), theta=np.zeros(1)),
-        _short=lambda forms, theta: np.ones((2, 3)),
-        _at_bounds=lambda forms, theta: [],
+        _short=lambda terms, theta: np.ones((2, 3)),
+        _at_bounds=lambda terms, forms, theta: [],
     )
-    judged = _Explain._evaluated(search, (), np.zeros(1), 0.5 * np.ones((2, 3)), 10, [])
+    present = Present((), np.zeros(1), np.ones((2, 3)))
+    judged = TermFits._evaluated(search, present, (), np.zeros(1), 0.5 * np.ones((2, 3)), 10, [])
     assert judged.sure == bool(added)
     assert judged.short == (None if ratio > 0.95 else brief)
 
@@ -472,7 +473,7 @@ def test_a_further_parameter_must_gain_as_much_as_a_further_term(worse, simple):
     )
     error = HeldOutError(0.1, 0.5, 0.4, 0.6, 0.0)
     near, best = (
-        _Fitted((form,), replace(error, ratio=r), np.zeros(1), np.array([r]), sure=True)
+        FittedCandidate((form,), replace(error, ratio=r), np.zeros(1), np.array([r]), sure=True)
         for form, r in ((dry, worse * 0.5), (other, 0.5))
     )
     evidence = SimpleNamespace(compared=lambda own, than, n: replace(error, ratio=float(own[0] / than[0])))
@@ -490,7 +491,7 @@ def test_a_further_parameter_must_gain_as_much_as_a_further_term(worse, simple):
 def test_the_outcome_does_not_contradict_the_ratio(ratio, outcome, words):
     error = HeldOutError(error=0.1, ratio=ratio, lower=0.7, upper=1.2, harm=0.5)
     trial = _Explain._trial(
-        SimpleNamespace(), _Fitted((), error, np.zeros(1), np.zeros(1), "why", False), None
+        SimpleNamespace(), FittedCandidate((), error, np.zeros(1), np.zeros(1), "why", False), None
     )
     assert (trial.outcome, trial.outcome_words) == (outcome, words)
     assert "(0.70 to 1.20)" in error.words
@@ -551,3 +552,30 @@ def test_a_lag_is_found_beside_a_state_that_no_output_measures():
     found = explain(Reactor, fit.values, known, dt=dt, length=300.0, warm_up=100.0, candidates=pool)
     assert [term.name for term in found.found] == ["lag of jacket"]
     assert found.values["tau_jacket"] == pytest.approx(lag, rel=0.15)
+
+
+def test_candidates_may_be_fitted_in_other_processes():
+    """Answers from pickled work and windows of their own, in reverse order, are those of one process."""
+    level = Parameter("F", 0.15, "N m", 0.0, 1.0)
+    runs = recorded(extended(Pendulum, terms.coulomb("phi_dot", level, width=0.05))(), 4, 4.0)
+    dry = terms.coulomb("phi_dot", Parameter("F_c", 0.0, "N m", 0.0, 1.0), width=0.05)
+    tau = Parameter("tau", 0.1, "s", 0.01, 1.0)
+    lag = terms.input_lag("torque", tau, state=Signal("late", "N m", -9.0, 9.0))
+    pool = [Candidate(one.name, (one,)) for one in (dry, lag)]
+    stiff = own(lambda at, p: -p.k_own * ca.tanh(at.own / 1e-6), name="stiff")
+    known = smoothed(Pendulum, fit_prior(Pendulum, runs, [], dt=DT, length=2.0), runs, DT)
+    other = TermFits(Pendulum, Pendulum().values, known, DT, 1.0, 0.0, (stiff,))
+
+    def answers(works):
+        for i, work in reversed(list(enumerate(pickle.loads(pickle.dumps(works))))):
+            yield i, pickle.loads(pickle.dumps(other.answer(work)))
+
+    found = [
+        explain(
+            Pendulum, Pendulum().values, known, dt=DT, length=1.0, candidates=pool, own=(stiff,), answers=way
+        )
+        for way in (None, answers)
+    ]
+    assert found[0] == found[1]
+    assert [term.name for term in found[0].found] == [dry.name]
+    assert found[0].diverged

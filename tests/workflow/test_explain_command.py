@@ -13,7 +13,7 @@ from hybrid_mpc import InputError, RunSettings, extended, load_scenario, terms, 
 from hybrid_mpc.check.preflight import check_scenario
 from hybrid_mpc.cli.explain import summary
 from hybrid_mpc.data.scales import time_unit
-from hybrid_mpc.identify.explain import ADDED
+from hybrid_mpc.identify.evidence import ADDED
 from hybrid_mpc.plots.explain import error_steps
 from hybrid_mpc.records import plain
 from hybrid_mpc.workflow import explain_page, explain_search
