@@ -212,7 +212,7 @@ class _Explain:
         chosen = self._chosen(fitted)
         both: list[FittedCandidate] = []
         if chosen is None:
-            some = pairs.best(PAIRS, singles)
+            some = pairs().best(PAIRS, singles)
             both = [self._as_needed(one) for one in self._fitted(some, f"step {number}, pairs")]
             fitted += both
             chosen = self._chosen(both)
@@ -224,8 +224,8 @@ class _Explain:
         trials = [self._trial(one, chosen) for one in fitted] + diverged
         return tuple(trials), len(self.pool), chosen
 
-    def _scored(self, number: int) -> tuple[_Ranked, _Ranked, list[Trial]]:
-        """Single terms and pairs with the logarithm of their predicted ratio of errors, and failed candidates."""
+    def _scored(self, number: int) -> tuple[_Ranked, Callable[[], _Ranked], list[Trial]]:
+        """Single terms with the logarithm of their predicted ratio of errors, those of pairs, and failed candidates."""
         search, now = self.search, self.now
         self.on_progress(0, len(self.pool), f"step {number}: scoring {len(self.pool)} candidates")
         plain = [(k, form) for k, one in enumerate(self.pool) for form in one.forms if _vanishes(form)]
@@ -253,12 +253,16 @@ class _Explain:
             else:
                 diverged.append(Trial((_found(form),), "diverged", None, str(score)))
         lists[0] += scores.values()
-        pairs: list[list[tuple[float, Terms]]] = [[], []]
-        for by, ranked, found in zip(promises, among, pairs, strict=True):
-            for (_, i), (_, j) in combinations(ranked, 2):
-                if not set(plain[i][1].names) & set(plain[j][1].names):
-                    found.append((by.of(i, j), (plain[i][1], plain[j][1])))
-        return _Ranked(*lists), _Ranked(*pairs), diverged
+
+        def pairs() -> _Ranked:
+            both: list[list[tuple[float, Terms]]] = [[], []]
+            for by, ranked, found in zip(promises, among, both, strict=True):
+                for (_, i), (_, j) in combinations(ranked, 2):
+                    if not set(plain[i][1].names) & set(plain[j][1].names):
+                        found.append((by.of(i, j), (plain[i][1], plain[j][1])))
+            return _Ranked(*both)
+
+        return _Ranked(*lists), pairs, diverged
 
     def _fitted(self, some: Sequence[Terms], text: str) -> list[FittedCandidate]:
         """Fit candidates in every fold and evaluate them."""

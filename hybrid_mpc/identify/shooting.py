@@ -190,10 +190,13 @@ class Shooting:
         self.explained([theta])
         return self._known[theta.tobytes()][1]
 
-    def solve(self, theta: Array, iterations: int = ITERATIONS) -> Fitted:
-        """Fit ``theta`` and the initial states; errors are scaled by the spreads first, then by the residuals."""
+    def solve(self, theta: Array, iterations: int = ITERATIONS, first: Array | None = None) -> Fitted:
+        """Fit ``theta`` and the initial states; errors are scaled by the spreads first, then by the residuals.
+
+        ``first`` ``(n, n_x)`` are the best initial states for ``theta``, if they are known.
+        """
         theta = np.clip(theta, self.own.lower, self.own.upper)
-        point = self.start(theta, self.first_states(theta), "all")
+        point = self.start(theta, self.first_states(theta) if first is None else first, "all")
         if len(theta):
             point = self._descend(point, min(iterations, FIRST))
             # maximum number of times that the scales are estimated again; outliers hide small residuals at first

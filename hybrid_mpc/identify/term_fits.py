@@ -248,10 +248,10 @@ class TermFits:
 
     def held_out(self, by: HeldOut, terms: Terms, theta: Array) -> Array:
         """Squared errors ``(n, T + 1)`` of every window with a fit to the other folds, which starts from ``theta``."""
-        squares = np.zeros(by.pieces.shape)
+        squares, first = np.zeros(by.pieces.shape), self.problem(terms, by.windows).first_states(theta)
         for fold in sorted(set(by.folds.tolist())):
             held = by.folds == fold
-            fitted = self.problem(terms, by.rows(~held)).solve(theta, ITERATIONS).theta
+            fitted = self.problem(terms, by.rows(~held)).solve(theta, ITERATIONS, first[~held]).theta
             squares[held] = squared_errors(self.evaluation(by, terms, fitted, held), fitted)
         return squares
 

@@ -270,7 +270,7 @@ def test_of_a_pair_with_a_needless_term_the_other_one_is_tried_alone():
     own = SimpleNamespace(
         steps=[], pool=[], search=search, now=SimpleNamespace(terms=()),
         evidence=SimpleNamespace(compared=lambda a, b, n: replace(error, ratio=float(a[0] / b[0]))),
-        _scored=lambda number: (SimpleNamespace(best=lambda count: []), ranked, []),
+        _scored=lambda number: (SimpleNamespace(best=lambda count: []), lambda: ranked, []),
         _fitted=lambda some, text: [pair if len(forms) == 2 else alone for forms in some],
         _trial=lambda one, chosen: one,
     )  # fmt: skip
