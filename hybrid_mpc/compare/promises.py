@@ -25,7 +25,7 @@ from hybrid_mpc.estimate.offset_free import OffsetFree, distinguishable, offset_
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
 from hybrid_mpc.estimate.tuning import periods_to_find
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.kit.assembly import SEARCHED, make_ocp
+from hybrid_mpc.kit.assembly import SEARCHED, make_controller, make_ocp
 from hybrid_mpc.kit.disturbances import loads_by_parameters, rates_of_outputs
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.plant import ModelPlant, ModelState
@@ -122,11 +122,13 @@ INWARD = (
 )
 """Remedy for a bound that the run's loops violate."""
 SOFTER = "Increase the weights of changes (r_delta), or reduce the process noise; hybrid-mpc analyze shows details."
+SLOWER = (10.0, 100.0, 1000.0)
+"""Factors of the change weights with which a loop that does not settle with late inputs is tried again."""
 LATE = (
-    "Increase the weights of changes (r_delta) 10 to 100 times, or model the delay: by a state with the actuator's "
-    "lag, or by largest_delay of the data (docs/clocks.md#known-delays)."
+    "Model the delay: by a state with the actuator's lag, or by largest_delay of the data "
+    "(docs/clocks.md#known-delays)."
 )
-"""Remedy for a loop that does not settle with late inputs."""
+"""Remedy for a loop that does not settle with late inputs. Larger change weights come first, if they suffice."""
 LATE_INPUTS = "late inputs"
 """Name of the row on late inputs."""
 BY_NETWORK = (
@@ -856,18 +858,20 @@ def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
     return min(found, default=None)
 
 
-def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
+def late_inputs(point: SetPoint, prior: HybridModel, lacking_s: float = 0.0) -> Promise | None:
     """Row "late inputs": a loop on the model itself, with inputs that act later than in the model.
 
     At the start each controlled output is off its set-point by its spread in the recordings. Margins of the linearized
-    loop hold for small motions only: with inputs at their limits, a large motion can start swings that never end.
+    loop hold for small motions only: with inputs at their limits, a large motion can start swings that never end. Then
+    larger change weights are tried.
 
     Args:
         point: The set-point.
+        prior: The fitted prior, for terminal weight and fallback of a controller with other weights.
         lacking_s: Delay [s] that the recordings show and the model lacks. Default: none; then one period.
 
     Returns:
-        None if the loop does not settle without a delay either (other rows name the reason), or if a spread is unknown.
+        None if a spread is unknown.
     """
     model, (x, u) = point.model, point.rest
     slopes = output_with_jacobian(model)(x, u, point.w)[1].full()[point.held]
@@ -878,7 +882,7 @@ def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
     start = np.clip(start, *np.array([(s.lower, s.upper) for s in model.states]).T)
     late, periods = max(1, math.ceil(lacking_s / model.dt - ROUNDING)), LASTS * point.problem.horizon
     plant = ModelPlant(model, tuple(point.sigma))
-    if not np.isfinite(start).all() or tried(point, plant, start, periods).why:
+    if not np.isfinite(start).all():
         return None
     moved = ", ".join(
         f"{model.outputs[i].name} by {size:.2g} {model.outputs[i].unit}"
@@ -887,12 +891,37 @@ def late_inputs(point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
     recorded = (
         f"; in the recordings inputs act {lacking_s:.2g} s later than in the prior" if lacking_s else ""
     )
+    in_time = tried(point, plant, start, periods)
+    if in_time.why:
+        evidence = (
+            f"not examined: the loop on the model itself does not settle after a deviation ({moved}), even without a "
+            f"delay: {in_time.why}"
+        )
+        return Promise(LATE_INPUTS, "not promised", evidence, choose_remedy(in_time.why))
     found = tried(point, plant, start, periods, late=late)
     when = f"after a deviation ({moved}) with inputs {counted(late, 'period')} late"
     if not found.why:
         return Promise(LATE_INPUTS, "shown", f"the loop on the model itself settles {when}{recorded}")
     evidence = f"the loop on the model itself does not settle {when}: {found.worst}{recorded}"
+    for factor in SLOWER:
+        slower = _with_change_weights(point, prior, factor)
+        if not tried(slower, plant, start, periods, late=late).why:
+            weights = ", ".join(f"{v:.2g}" for v in slower.problem.r_delta)
+            return Promise(
+                LATE_INPUTS,
+                "doubted",
+                evidence,
+                f"Set r_delta=({weights},): with it, the loop settles. Or: {LATE}",
+            )
     return Promise(LATE_INPUTS, "doubted", evidence, LATE)
+
+
+def _with_change_weights(point: SetPoint, prior: HybridModel, factor: float) -> SetPoint:
+    """The same set-point with larger weights of input changes; inputs without one get ``factor`` times theirs."""
+    problem = point.problem.changed(
+        r_delta=factor * np.where(point.problem.r_delta > 0, point.problem.r_delta, point.problem.r)
+    )
+    return replace(point, problem=problem, controller=make_controller(point.model, prior, problem))
 
 
 # Limits.
@@ -1283,7 +1312,7 @@ def examine(
     if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer)
     elsewhere = loads_elsewhere(kit, points[0])
-    late = late_inputs(points[0], lacking_delay)
+    late = late_inputs(points[0], kit.models["prior"], lacking_delay)
     return (
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
         *([] if elsewhere is None else [elsewhere]),
