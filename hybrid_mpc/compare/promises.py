@@ -128,7 +128,7 @@ LATE = (
     "Model the delay: by a state with the actuator's lag, or by largest_delay of the data "
     "(docs/clocks.md#known-delays)."
 )
-"""Remedy for a loop that does not settle with late inputs. Larger change weights come first, if they suffice."""
+"""Remedy for a loop that does not settle with late inputs, beside larger change weights if they suffice."""
 LATE_INPUTS = "late inputs"
 """Name of the row on late inputs."""
 BY_NETWORK = (
@@ -906,12 +906,12 @@ def late_inputs(point: SetPoint, prior: HybridModel, lacking_s: float = 0.0) -> 
     for factor in SLOWER:
         slower = _with_change_weights(point, prior, factor)
         if not tried(slower, plant, start, periods, late=late).why:
-            weights = ", ".join(f"{v:.2g}" for v in slower.problem.r_delta)
+            weights = ", ".join(f"{v:g}" for v in slower.problem.r_delta)
             return Promise(
                 LATE_INPUTS,
                 "doubted",
                 evidence,
-                f"Set r_delta=({weights},): with it, the loop settles. Or: {LATE}",
+                f"{LATE} Or set r_delta=({weights},): then the loop settles.",
             )
     return Promise(LATE_INPUTS, "doubted", evidence, LATE)
 

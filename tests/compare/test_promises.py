@@ -354,7 +354,7 @@ def test_inputs_that_act_as_late_as_the_recordings_show_are_a_doubt_if_the_loop_
     assert "3 periods late: level" in late.evidence
     assert late.evidence.endswith("inputs act 0.3 s later than in the prior")
     # the remedy's weights keep the promise
-    (weight,) = re.findall(r"r_delta=\(([0-9.e+]+),\)", late.remedy)
+    (weight,) = re.findall(r"r_delta=\(([0-9.]+),\)", late.remedy)
     cautious = OCP(20, [0.0], [0.0], [float(weight)], [-1.0], [1.0], q_y=[10.0])
     slower = p.late_inputs(point_of(kit_of(tank(), cautious)), prior, lacking_s=0.3)
     assert (slower.verdict, slower.remedy) == ("shown", "")
