@@ -21,6 +21,8 @@ from hybrid_mpc.machine.specification import ChoiceRule
 
 Array = NDArray[np.float64]
 RULE = ChoiceRule()
+HARMFUL = 1.05
+"""Ratio of errors above which a hybrid is harmful."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +34,14 @@ class CandidateFigures:
         ratio: Error over the prior's [-]; for several recordings the geometric mean of their ratios.
         upper: Upper bound of the ratio at the confidence level of the :class:`~hybrid_mpc.ChoiceRule` [-].
         share: Share of the networks' correction in the candidate. Default: the full correction.
+        harm: Probability that the error is more than 5 % larger than the prior's. Default: 1, also without a bound.
     """
 
     error: float
     ratio: float
     upper: float
     share: float = 1.0
+    harm: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,8 @@ class Choice:
         candidates: Figures by candidate.
         reason: One sentence for the report.
         blocks: Number of recordings or blocks that were compared.
-        sure: The hybrids that are significantly better than the prior.
+        sure: The hybrids that are significantly better than the prior, as the :class:`~hybrid_mpc.ChoiceRule` asks.
+        confidence: Confidence level of the upper bounds.
     """
 
     recommended: str
@@ -59,6 +64,7 @@ class Choice:
     reason: str
     blocks: int
     sure: tuple[str, ...] = ()
+    confidence: float = RULE.confidence
 
     def share(self, name: str) -> float:
         """Share of the networks' correction in a model; 1 for a model that is not a candidate."""
@@ -78,8 +84,9 @@ def recommend(
 ) -> Choice:
     """Choose among the prior and hybrids by their squared errors over the same held-out runs.
 
-    A hybrid is significantly better than the prior if the upper bound of its ratio is below 1 and its error over all
-    runs together is smaller too. Of several such hybrids, the one with the lowest ratio is recommended.
+    A hybrid is significantly better than the prior if the upper bound of its ratio is below the rule's limit (default
+    1) and its error over all runs together is smaller too. Of several such hybrids, the one with the lowest ratio is
+    recommended.
 
     - Two or more recordings: the ratio is the geometric mean over the recordings of the hybrid's error over the
       prior's. Its bound is that of the mean of the logarithms (Student's t). So a single recording with a large error
@@ -98,7 +105,7 @@ def recommend(
         shrunk: ``(name, share) -> errors`` of a hybrid with a share of its networks' correction. It is called if the
             full correction is not significantly better than the prior. The largest share of the rule that is
             significantly better is used, else the full correction. Default: only the full correction.
-        rule: Confidence level, shares, and fewest recordings. Default: 95 %.
+        rule: Confidence level, limit of the bound, shares, and fewest recordings. Default: 95 %, 1.
 
     Raises:
         InputError: If ``deploy`` is not a candidate, or there is no validation run.
@@ -137,12 +144,12 @@ def recommend(
     chosen = min(safe, key=lambda name: (figures[name].ratio, figures[name].error), default=prior)
     pieces = compared.pieces
     of_what = f"{evidence}, their geometric mean" if compared.whole else "block" if pieces == 1 else "blocks"
-    reason = _reason(figures, best, chosen, prior, f"{pieces} {of_what}")
+    reason = _reason(figures, best, chosen, prior, f"{pieces} {of_what}", rule.limit)
     if deploy and deploy != chosen:
         reason = f"{deploy} is deployed as requested. {reason}"
     asked = deploy if deploy != prior else ""
     hybrid = asked or (chosen if chosen != prior else best)
-    return Choice(deploy or chosen, hybrid, figures, reason, pieces, tuple(safe))
+    return Choice(deploy or chosen, hybrid, figures, reason, pieces, tuple(safe), rule.confidence)
 
 
 class _Compared:
@@ -171,7 +178,7 @@ class _Compared:
         """Figures of a candidate from its squared errors by run."""
         own = _sums(runs, self._cuts)
         if np.array_equal(own, self._prior) and np.isfinite(own).all():
-            return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share)
+            return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share, 0.0)
         found = _by_blocks(own, self._prior, self._sizes, self._rule)
         if self.whole:
             of_own, of_prior = (np.bincount(self._of, v).astype(np.float64) for v in (own, self._prior))
@@ -179,8 +186,8 @@ class _Compared:
         return replace(found, share=share)
 
     def sure(self, figures: CandidateFigures) -> bool:
-        """Whether a candidate is significantly better than the prior, and also better over all runs together."""
-        return figures.upper < 1.0 and figures.error < _root_mean(self._prior, self._sizes)
+        """Whether the bound is below the rule's limit, and the candidate is better over all runs together."""
+        return figures.upper < self._rule.limit and figures.error < _root_mean(self._prior, self._sizes)
 
 
 def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tuple[list[str], str]:
@@ -199,7 +206,9 @@ def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tupl
     return (parts, "parts of one recording") if parts else (files, "recordings")
 
 
-def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str) -> str:
+def _reason(
+    figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str, limit: float
+) -> str:
     if best == prior:
         return "The fitted prior is recommended: no network was trained."
     if not math.isfinite(figures[best].error):
@@ -207,8 +216,10 @@ def _reason(figures: Mapping[str, CandidateFigures], best: str, chosen: str, pri
     own = figures[best if chosen == prior else chosen]
     bound = f"upper bound {own.upper:.2f}" if math.isfinite(own.upper) else "no upper bound: too few data"
     whose = "its error" if own.share == 1 else f"with {own.share:g} of its correction, its error"
+    if own.ratio < 1.0 <= own.upper and own.harm < 1.0:
+        bound += f", probability of harm {100 * own.harm:.0f} %"
     error = f"{whose} on held-out data is {own.ratio:.2f} times the prior's ({bound}; {blocks})"
-    if chosen == prior and own.upper < 1.0:
+    if chosen == prior and own.upper < limit:
         error += ", but the prior's error over all these data together is not larger"
     if chosen == prior:
         return f"The fitted prior is recommended: {best} is not significantly better; {error}."
@@ -246,14 +257,15 @@ def _by_blocks(own: Array, prior: Array, sizes: Array, rule: ChoiceRule) -> Cand
     if not math.isfinite(error):
         return CandidateFigures(math.inf, math.inf, math.inf)
     if not np.isfinite(prior).all():
-        return CandidateFigures(error, 0.0, 0.0)
+        return CandidateFigures(error, 0.0, 0.0, harm=0.0)
     ratio = float(np.sqrt(own.sum() / max(float(prior.sum()), 1e-300)))
     if n < 2:
         return CandidateFigures(error, ratio, math.inf)
     without = 0.5 * np.log(np.maximum(own.sum() - own, 1e-300) / np.maximum(prior.sum() - prior, 1e-300))
     scatter = math.sqrt((n - 1) / n * float(np.sum(np.square(without - without.mean()))))
-    bound = math.log(max(ratio, 1e-300)) + float(student.ppf(rule.confidence, n - 1)) * scatter
-    return CandidateFigures(error, ratio, math.exp(min(bound, 700.0)))
+    mean = math.log(max(ratio, 1e-300))
+    bound = mean + float(student.ppf(rule.confidence, n - 1)) * scatter
+    return CandidateFigures(error, ratio, math.exp(min(bound, 700.0)), harm=_harm(mean, scatter, n))
 
 
 def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures, rule: ChoiceRule) -> CandidateFigures:
@@ -264,9 +276,19 @@ def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures, rule: Cho
     if not np.isfinite(own).all() or not np.isfinite(prior).all():
         return blocks
     n, each = len(own), 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
-    most = math.inf  # no bound from two recordings: they may agree by chance
+    mean, most, harm = (
+        float(each.mean()),
+        math.inf,
+        1.0,
+    )  # no bound from two recordings: they may agree by chance
     if n >= rule.fewest:
-        most = float(each.mean() + student.ppf(rule.confidence, n - 1) * each.std(ddof=1) / math.sqrt(n))
+        scatter = float(each.std(ddof=1)) / math.sqrt(n)
+        most, harm = mean + float(student.ppf(rule.confidence, n - 1)) * scatter, _harm(mean, scatter, n)
     return CandidateFigures(
-        blocks.error, math.exp(float(each.mean())), math.exp(most) if most < 700 else math.inf
+        blocks.error, math.exp(mean), math.exp(most) if most < 700 else math.inf, harm=harm
     )
+
+
+def _harm(mean: float, scatter: float, n: int) -> float:
+    """Probability that the logarithm of a ratio exceeds that of ``HARMFUL``, by Student's t with ``n - 1`` degrees."""
+    return float(student.cdf((mean - math.log(HARMFUL)) / max(scatter, 1e-12), n - 1))

@@ -126,9 +126,12 @@ def test_recordings_count_alike_however_far_off_the_prior_is():
     assert choice.candidates["pgrnn"].ratio == pytest.approx(np.exp(logs.mean()))
     upper = np.exp(logs.mean() + 2.015 * logs.std(ddof=1) / np.sqrt(6))
     assert choice.candidates["pgrnn"].upper == pytest.approx(upper, rel=1e-3)
+    # harm by hand: Student's distribution beyond log 1.05
+    harm = student.cdf((logs.mean() - np.log(1.05)) / (logs.std(ddof=1) / np.sqrt(6)), 5)
+    assert choice.candidates["pgrnn"].harm == pytest.approx(harm)
     assert (
-        f"is {np.exp(logs.mean()):.2f} times the prior's (upper bound {upper:.2f}; 6 recordings, their geometric mean)"
-        in choice.reason
+        f"is {np.exp(logs.mean()):.2f} times the prior's (upper bound {upper:.2f}, "
+        f"probability of harm {100 * harm:.0f} %; 6 recordings, their geometric mean)" in choice.reason
     )
     better = [0.25 * own for own in prior]
     assert recommend({"phy": prior, "pgrnn": better}, recordings=names).recommended == "pgrnn"
@@ -286,3 +289,20 @@ def test_a_rule_asks_for_more_evidence_for_fewer_recordings_and_for_other_shares
         shrunk=lambda name, share: asked.append(share) or errors[name],
     )  # fmt: skip
     assert asked == [0.3]
+
+
+def test_a_limit_above_one_recommends_the_best_expectation_if_harm_is_improbable():
+    prior = runs(np.random.default_rng(8), n=6)
+    factors = (0.3, 0.5, 0.6, 0.95, 1.1, 0.8)
+    errors = {"phy": prior, "pgrnn": [f**2 * own for f, own in zip(factors, prior, strict=True)]}
+    names = [f"file{i}" for i in range(6)]
+    safe, expected = (
+        recommend(errors, recordings=names, rule=rule)
+        for rule in (ChoiceRule(confidence=0.99), ChoiceRule(confidence=0.9, limit=1.05))
+    )
+    assert (safe.recommended, safe.confidence) == ("phy", 0.99)
+    assert (expected.recommended, expected.confidence) == ("pgrnn", 0.9)
+    own = expected.candidates["pgrnn"]
+    # the bound at 90 % is below 1.05 where the probability of a larger ratio is below 10 %
+    assert (own.upper < 1.05) == (own.harm < 0.1)
+    assert own.harm == pytest.approx(safe.candidates["pgrnn"].harm)

@@ -54,7 +54,7 @@ def model_answer(results: Results) -> Answer:
     else:
         lines.append(
             f"On held-out recordings, its error is {hybrid.ratio:.2f} times that of the fitted prior "
-            f"(95 % upper bound {hybrid.upper:.2f})."
+            f"({100 * choice.confidence:g} % upper bound {hybrid.upper:.2f})."
         )
     return Answer("Is the model good?", verdict, short, lines)
 

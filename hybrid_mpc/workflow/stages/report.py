@@ -417,16 +417,17 @@ def _choice_table(found: ChoiceResult) -> Table:
     choice = found.choice
     rows = [
         (name_of(name), None if name == "phy" else f"{100 * c.share:.0f} %", finite(c.error), finite(c.ratio),
-         None if name == "phy" else finite(c.upper),
+         None if name == "phy" else finite(c.upper), None if name == "phy" else f"{100 * c.harm:.0f} %",
          "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]  # fmt: skip
-    columns = ("model", "correction", "error [-]", "ratio to prior", "95 % upper bound", "")
+    upper = f"{100 * choice.confidence:g} % upper bound"
+    columns = ("model", "correction", "error [-]", "ratio to prior", upper, "harm", "")
     caption = (
         f"Choice of the model on held-out parts of the training data. {choice.reason} The error is over all parts "
         "together. The ratio is the geometric mean of the ratios of the parts; the upper bound refers to this mean. "
         "Correction: share of the networks' correction that the model uses; below 100 % if the full correction is not "
-        "significantly better."
+        "significantly better. Harm: probability that the error is more than 5 % larger than the prior's."
     )
     return Table(columns, rows, caption)
 
