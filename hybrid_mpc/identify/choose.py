@@ -35,6 +35,7 @@ class CandidateFigures:
         upper: Upper bound of the ratio at the confidence level of the :class:`~hybrid_mpc.ChoiceRule` [-].
         share: Share of the networks' correction in the candidate. Default: the full correction.
         harm: Probability that the error is more than 5 % larger than the prior's. Default: 1, also without a bound.
+        worst: Largest ratio to the prior's error of an output, over all runs together [-]. Default: 1.
     """
 
     error: float
@@ -42,6 +43,7 @@ class CandidateFigures:
     upper: float
     share: float = 1.0
     harm: float = 1.0
+    worst: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,8 @@ def recommend(
     """Choose among the prior and hybrids by their squared errors over the same held-out runs.
 
     A hybrid is significantly better than the prior if the upper bound of its ratio is below the rule's limit (default
-    1) and its error over all runs together is smaller too. Of several such hybrids, the one with the lowest ratio is
-    recommended.
+    1), its error over all runs together is smaller too, and that of no output is larger than the rule allows. Of
+    several such hybrids, the one with the lowest ratio is recommended.
 
     - Two or more recordings: the ratio is the geometric mean over the recordings of the hybrid's error over the
       prior's. Its bound is that of the mean of the logarithms (Student's t). So a single recording with a large error
@@ -95,8 +97,8 @@ def recommend(
       (a contiguous part of a run) after the other is left out.
 
     Args:
-        errors: Squared errors of each run ``(n,)`` [-], by candidate: the mean over the outputs of the squared error
-            over the squared spread.
+        errors: Squared errors of each run [-] over the squared spread, by candidate: of each output ``(n, n_y)``, NaN
+            where it is not measured, or their mean ``(n,)``.
         prior: Name of the prior in ``errors``.
         deploy: Candidate to recommend whatever the figures are. Default: none.
         samples: Minimum samples of a block; errors within a block are correlated. Default: 1.
@@ -105,7 +107,7 @@ def recommend(
         shrunk: ``(name, share) -> errors`` of a hybrid with a share of its networks' correction. It is called if the
             full correction is not significantly better than the prior. The largest share of the rule that is
             significantly better is used, else the full correction. Default: only the full correction.
-        rule: Confidence level, limit of the bound, shares, and fewest recordings. Default: 95 %, 1.
+        rule: Confidence level, limits, shares, and fewest recordings. Default: 95 %, 1.
 
     Raises:
         InputError: If ``deploy`` is not a candidate, or there is no validation run.
@@ -144,7 +146,7 @@ def recommend(
     chosen = min(safe, key=lambda name: (figures[name].ratio, figures[name].error), default=prior)
     pieces = compared.pieces
     of_what = f"{evidence}, their geometric mean" if compared.whole else "block" if pieces == 1 else "blocks"
-    reason = _reason(figures, best, chosen, prior, f"{pieces} {of_what}", rule.limit)
+    reason = _reason(figures, best, chosen, prior, f"{pieces} {of_what}", rule)
     if deploy and deploy != chosen:
         reason = f"{deploy} is deployed as requested. {reason}"
     asked = deploy if deploy != prior else ""
@@ -158,7 +160,7 @@ class _Compared:
     def __init__(
         self, prior: Sequence[Array], samples: int, recordings: Sequence[str], rule: ChoiceRule
     ) -> None:
-        self._rule = rule
+        self._rule, self._by_output = rule, _sums_of_outputs(prior)
         self._cuts = _cuts([len(run) for run in prior], samples)
         self._sizes = np.array([b - a for run in self._cuts for a, b in run])
         # errors within a recording are correlated, and recordings can differ from day to day
@@ -176,18 +178,22 @@ class _Compared:
 
     def figures(self, runs: Sequence[Array], share: float = 1.0) -> CandidateFigures:
         """Figures of a candidate from its squared errors by run."""
-        own = _sums(runs, self._cuts)
+        own, by_output = _sums(runs, self._cuts), _sums_of_outputs(runs)
         if np.array_equal(own, self._prior) and np.isfinite(own).all():
             return CandidateFigures(_root_mean(own, self._sizes), 1.0, 1.0, share, 0.0)
         found = _by_blocks(own, self._prior, self._sizes, self._rule)
         if self.whole:
             of_own, of_prior = (np.bincount(self._of, v).astype(np.float64) for v in (own, self._prior))
             found = _by_recordings(of_own, of_prior, found, self._rule)
-        return replace(found, share=share)
+        known = np.isfinite(self._by_output) & (self._by_output > 0)
+        ratios = by_output[known] / self._by_output[known]
+        worst = math.sqrt(float(ratios.max())) if ratios.size else 1.0
+        return replace(found, share=share, worst=worst)
 
     def sure(self, figures: CandidateFigures) -> bool:
         """Whether the bound is below the rule's limit, and the candidate is better over all runs together."""
-        return figures.upper < self._rule.limit and figures.error < _root_mean(self._prior, self._sizes)
+        better = figures.upper < self._rule.limit and figures.error < _root_mean(self._prior, self._sizes)
+        return better and figures.worst <= self._rule.each
 
 
 def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tuple[list[str], str]:
@@ -207,7 +213,7 @@ def evidence_of(runs: Sequence[tuple[int | None, Sequence[Trajectory]]]) -> tupl
 
 
 def _reason(
-    figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str, limit: float
+    figures: Mapping[str, CandidateFigures], best: str, chosen: str, prior: str, blocks: str, rule: ChoiceRule
 ) -> str:
     if best == prior:
         return "The fitted prior is recommended: no network was trained."
@@ -219,8 +225,12 @@ def _reason(
     if own.ratio < 1.0 <= own.upper and own.harm < 1.0:
         bound += f", probability of harm {100 * own.harm:.0f} %"
     error = f"{whose} on held-out data is {own.ratio:.2f} times the prior's ({bound}; {blocks})"
-    if chosen == prior and own.upper < limit:
-        error += ", but the prior's error over all these data together is not larger"
+    if chosen == prior and own.upper < rule.limit:
+        error += (
+            f", but that of an output is {own.worst:.2f} times the prior's"
+            if own.worst > rule.each
+            else ", but the prior's error over all these data together is not larger"
+        )
     if chosen == prior:
         return f"The fitted prior is recommended: {best} is not significantly better; {error}."
     return f"{chosen} is recommended: {error}."
@@ -239,7 +249,13 @@ def _cuts(lengths: Sequence[int], samples: int) -> list[list[tuple[int, int]]]:
 
 
 def _sums(runs: Sequence[Array], cuts: Sequence[Sequence[tuple[int, int]]]) -> Array:
-    return np.array([float(np.sum(run[a:b])) for run, own in zip(runs, cuts, strict=True) for a, b in own])
+    means = [run if run.ndim == 1 else np.nanmean(run, axis=1) for run in runs]
+    return np.array([float(np.sum(run[a:b])) for run, own in zip(means, cuts, strict=True) for a, b in own])
+
+
+def _sums_of_outputs(runs: Sequence[Array]) -> Array:
+    """Sum over all runs of the squared errors of each output ``(n_y,)``."""
+    return np.asarray(sum(np.nansum(run.reshape(len(run), -1), axis=0) for run in runs))
 
 
 def _root_mean(sums: Array, sizes: Array) -> float:

@@ -66,11 +66,16 @@ class FreeRun:
 
     def squared_errors(self, spread: Sequence[float]) -> Array:
         """Mean over the outputs of the squared error over ``spread`` ``(n_y,)``, for measured samples ``(m,)``."""
-        squares = np.square((self.y_hat - self.y) / np.array(spread))
-        seen = np.isfinite(self.y).any(axis=1)
-        with np.errstate(invalid="ignore"):
-            squares = np.where(np.isfinite(self.y) & ~np.isfinite(squares), np.inf, squares)
-        return np.asarray(np.nanmean(squares[seen], axis=1))
+        return np.asarray(np.nanmean(self.squares_by_output(spread), axis=1))
+
+    def squares_by_output(self, spread: Sequence[float]) -> Array:
+        """Squared error over ``spread`` ``(n_y,)`` of each output, for measured samples ``(m, n_y)``; NaN where an
+        output is not measured, infinite where the run diverged.
+        """
+        with np.errstate(invalid="ignore", over="ignore"):
+            squares = np.square((self.y_hat - self.y) / np.array(spread))
+        squares = np.where(np.isfinite(self.y) & ~np.isfinite(squares), np.inf, squares)
+        return np.asarray(squares[np.isfinite(self.y).any(axis=1)])
 
 
 @dataclass(frozen=True)

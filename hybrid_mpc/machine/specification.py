@@ -156,6 +156,8 @@ class ChoiceRule:
         limit: Ratio of errors that the upper bound must be below. Default: 1, a hybrid that is surely not worse. With
             ``confidence=0.9, limit=1.05`` the best expectation is recommended whose probability of 5 % more error is
             below 10 %.
+        each: Largest ratio of errors of each output, over all held-out data together. Default: 1.1, so that an output
+            does not get much worse for the others' sake.
 
     Example:
         >>> ChoiceRule(confidence=0.975).shares
@@ -166,6 +168,7 @@ class ChoiceRule:
     shares: tuple[Share, ...] = (0.75, 0.5)
     fewest: Annotated[int, Within(2, 10**6, "a whole number from 2 to 1e6")] = 3
     limit: Annotated[float, Within(0.5, 2.0, "a ratio from 0.5 to 2")] = 1.0
+    each: Annotated[float, Within(1.0, 1e6, "a ratio from 1 to 1e6")] = 1.1
 
     def __post_init__(self) -> None:
         Fields(self, "choice rule").refuse()

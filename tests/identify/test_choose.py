@@ -306,3 +306,21 @@ def test_a_limit_above_one_recommends_the_best_expectation_if_harm_is_improbable
     # the bound at 90 % is below 1.05 where the probability of a larger ratio is below 10 %
     assert (own.upper < 1.05) == (own.harm < 0.1)
     assert own.harm == pytest.approx(safe.candidates["pgrnn"].harm)
+
+
+def test_no_output_gets_much_worse_for_the_others_sake():
+    rng = np.random.default_rng(3)
+    prior = [np.square(rng.standard_normal((100, 2))) for _ in range(5)]
+    names = [f"file{i}" for i in range(5)]
+
+    def chosen(factor, **rule):
+        hybrid = [own * np.array([0.01, factor**2]) for own in prior]
+        return recommend({"phy": prior, "pgrnn": hybrid}, recordings=names, rule=ChoiceRule(**rule))
+
+    good, bad, allowed = chosen(1.05), chosen(1.2), chosen(1.2, each=1.25)
+    assert [one.recommended for one in (good, bad, allowed)] == ["pgrnn", "phy", "pgrnn"]
+    assert bad.candidates["pgrnn"].worst == pytest.approx(1.2)
+    assert bad.candidates["pgrnn"].upper < 1.0
+    assert "that of an output is 1.20 times the prior's" in bad.reason
+    prior[0][:, 1] = np.nan  # an output without samples in a recording
+    assert chosen(1.2).candidates["pgrnn"].worst == pytest.approx(1.2)

@@ -78,7 +78,7 @@ def choice_stage(context: Context) -> ChoiceResult:
         ]
 
     def errors_of(name: str, share: float = 1.0) -> list[Array]:
-        return [run.squared_errors(smoother.sizes.y) for run, *_ in scored(name, share)[:n_left_out]]
+        return [run.squares_by_output(smoother.sizes.y) for run, *_ in scored(name, share)[:n_left_out]]
 
     samples = max(1, round(context.time_unit / spec.dt))
     recordings, evidence = evidence_of(runs)

@@ -417,17 +417,18 @@ def _choice_table(found: ChoiceResult) -> Table:
     choice = found.choice
     rows = [
         (name_of(name), None if name == "phy" else f"{100 * c.share:.0f} %", finite(c.error), finite(c.ratio),
-         None if name == "phy" else finite(c.upper), None if name == "phy" else f"{100 * c.harm:.0f} %",
+         *((None, None, None) if name == "phy" else (finite(c.upper), f"{100 * c.harm:.0f} %", finite(c.worst))),
          "recommended" if name == choice.recommended else "")
         for name, c in choice.candidates.items()
     ]  # fmt: skip
     upper = f"{100 * choice.confidence:g} % upper bound"
-    columns = ("model", "correction", "error [-]", "ratio to prior", upper, "harm", "")
+    columns = ("model", "correction", "error [-]", "ratio to prior", upper, "harm", "worst output", "")
     caption = (
         f"Choice of the model on held-out parts of the training data. {choice.reason} The error is over all parts "
         "together. The ratio is the geometric mean of the ratios of the parts; the upper bound refers to this mean. "
         "Correction: share of the networks' correction that the model uses; below 100 % if the full correction is not "
-        "significantly better. Harm: probability that the error is more than 5 % larger than the prior's."
+        "significantly better. Harm: probability that the error is more than 5 % larger than the prior's. "
+        "Worst output: largest ratio of an output, over all parts together."
     )
     return Table(columns, rows, caption)
 
