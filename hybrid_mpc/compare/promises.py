@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.analyze.linearize import linearize
-from hybrid_mpc.analyze.margins import Margins, mpc_loop, solved_gain, steady_filter
+from hybrid_mpc.analyze.margins import LinearLoop, Margins, mpc_loop, solved_gain, steady_filter
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.safeguard import SafeController, Source
 from hybrid_mpc.control.sizes import Sizes, disturbance_sizes
@@ -125,10 +125,11 @@ SOFTER = "Increase the weights of changes (r_delta), or reduce the process noise
 SLOWER = (10.0, 100.0, 1000.0)
 """Factors of the change weights with which a loop that does not settle with late inputs is tried again."""
 LATE = (
-    "Model the delay: by a state with the actuator's lag, or by largest_delay of the data "
+    "Model the delay: by a state with the actuator's lag, by largest_delay of the data, or by DelayCompensation "
     "(docs/clocks.md#known-delays)."
 )
-"""Remedy for a loop that does not settle with late inputs, beside larger change weights if they suffice."""
+"""Remedy for a loop that does not settle with late inputs. Another observer or larger change weights are added if they
+suffice."""
 LATE_INPUTS = "late inputs"
 """Name of the row on late inputs."""
 BY_NETWORK = (
@@ -809,11 +810,16 @@ def margins(
     """
     name = "stability margins"
     worst: tuple[SetPoint, Signal, Margins] | None = None
-    lacks, good = [], True
+    lacks, good, together = [], True, math.inf
     for point in points:
         try:
-            for signal, own in _margins_at(point):
-                lacking = lacking_delay / point.model.dt
+            found, lacking = _margins_at(point), lacking_delay / point.model.dt
+            if len(found) > 1:
+                together = min(
+                    together, _count_common_delay(point, min(own.delay_periods for _, own in found))
+                )
+            good &= together >= 1 + math.ceil(lacking)
+            for signal, own in found:
                 good &= own.modulus >= MODULUS and own.delay_periods >= 1 + lacking
                 if worst is None or own.modulus < worst[2].modulus:
                     worst = point, signal, own
@@ -825,8 +831,10 @@ def margins(
     late = counted(own.delay_periods, "period")
     evidence = (
         f"at {signal.name} in {point.title}: gain {own.gain_down:.2g} to {own.gain_up:.3g} times, phase "
-        f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay"
+        f"{math.degrees(own.phase):.3g} deg, distance from -1 {own.modulus:.2g}, {late} of delay, for small motions"
     )
+    if math.isfinite(together):
+        evidence += f"; of all inputs together {counted(int(together), 'period')} of delay"
     if lacking_delay:
         shown = lacking_delay / point.model.dt
         evidence += f", of which the recordings show {lacking_delay:.2g} s ({shown:.1f}) already"
@@ -841,12 +849,23 @@ def margins(
 
 
 def _margins_at(point: SetPoint) -> list[tuple[Signal, Margins]]:
+    loop = _linear_loop(point)
+    return [(signal, loop.margins(j)) for j, signal in enumerate(point.model.inputs)]
+
+
+def _count_common_delay(point: SetPoint, most: float) -> int:
+    """Largest whole delay [periods] of all inputs together, up to ``most``, at which the linearized loop is stable."""
+    every = range(1, math.floor(min(most, point.problem.horizon)) + 1)
+    return next((late - 1 for late in every if not _linear_loop(point, late).stable), len(every))
+
+
+def _linear_loop(point: SetPoint, late: int = 0) -> LinearLoop:
+    """The linearized loop of controller and quiet filter, with inputs ``late`` periods late."""
     model, (x, u) = point.model, point.rest
     h = hidden_fixed_point(model, x, u, w=point.w)
     gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.w)
     system = linearize(model, x, u, h)
-    loop = mpc_loop(gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system)
-    return [(signal, loop.margins(j)) for j, signal in enumerate(model.inputs)]
+    return mpc_loop(gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system, delay=late)
 
 
 def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
@@ -858,16 +877,16 @@ def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
     return min(found, default=None)
 
 
-def late_inputs(point: SetPoint, prior: HybridModel, lacking_s: float = 0.0) -> Promise | None:
+def late_inputs(kit: Kit, point: SetPoint, lacking_s: float = 0.0) -> Promise | None:
     """Row "late inputs": a loop on the model itself, with inputs that act later than in the model.
 
     At the start each controlled output is off its set-point by its spread in the recordings. Margins of the linearized
     loop hold for small motions only: with inputs at their limits, a large motion can start swings that never end. Then
-    larger change weights are tried.
+    the extended Kalman filter and larger change weights are tried.
 
     Args:
+        kit: The kit.
         point: The set-point.
-        prior: The fitted prior, for terminal weight and fallback of a controller with other weights.
         lacking_s: Delay [s] that the recordings show and the model lacks. Default: none; then one period.
 
     Returns:
@@ -903,17 +922,18 @@ def late_inputs(point: SetPoint, prior: HybridModel, lacking_s: float = 0.0) -> 
     if not found.why:
         return Promise(LATE_INPUTS, "shown", f"the loop on the model itself settles {when}{recorded}")
     evidence = f"the loop on the model itself does not settle {when}: {found.worst}{recorded}"
-    for factor in SLOWER:
-        slower = _with_change_weights(point, prior, factor)
-        if not tried(slower, plant, start, periods, late=late).why:
-            weights = ", ".join(f"{v:g}" for v in slower.problem.r_delta)
-            return Promise(
-                LATE_INPUTS,
-                "doubted",
-                evidence,
-                f"{LATE} Or set r_delta=({weights},): then the loop settles.",
-            )
-    return Promise(LATE_INPUTS, "doubted", evidence, LATE)
+
+    def settles(other: SetPoint) -> bool:
+        return not tried(other, plant, start, periods, late=late).why
+
+    remedy = LATE
+    if settles(replace(point, estimator=kit.observer(task=_find_own_problem(kit, point), kind="ekf"))):
+        remedy += ' Or use kit.observer(kind="ekf"): with it, the loop settles.'
+    slower = (_with_change_weights(point, kit.models["prior"], factor) for factor in SLOWER)
+    if (gentle := next(filter(settles, slower), None)) is not None:
+        weights = ", ".join(f"{v:g}" for v in gentle.problem.r_delta)
+        remedy += f" Or set r_delta=({weights},): then the loop settles."
+    return Promise(LATE_INPUTS, "doubted", evidence, remedy)
 
 
 def _with_change_weights(point: SetPoint, prior: HybridModel, factor: float) -> SetPoint:
@@ -1183,10 +1203,14 @@ def loads_elsewhere(kit: Kit, point: SetPoint) -> Promise | None:
     return Promise(name, "doubted", f"{evidence}, {where}", remedy)
 
 
+def _find_own_problem(kit: Kit, point: SetPoint) -> str:
+    """The set-point's task if it has a control problem of its own; empty otherwise."""
+    return next((name for name in point.tasks[:1] if name in kit.loop.control), "")
+
+
 def _with_disturbances(kit: Kit, point: SetPoint, chosen: tuple[Disturbance, ...]) -> SetPoint | None:
     """The same set-point with another disturbance model; None if no observer can be made with the kit's noise."""
-    of = kit.with_disturbances(chosen)
-    task = next((name for name in point.tasks[:1] if name in kit.loop.control), "")
+    of, task = kit.with_disturbances(chosen), _find_own_problem(kit, point)
     try:
         controller, estimator = of.controller(task=task), of.observer(task=task)
     except InputError:  # e.g. the process noise hides a disturbance
@@ -1312,7 +1336,7 @@ def examine(
     if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer)
     elsewhere = loads_elsewhere(kit, points[0])
-    late = late_inputs(points[0], kit.models["prior"], lacking_delay)
+    late = late_inputs(kit, points[0], lacking_delay)
     return (
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
         *([] if elsewhere is None else [elsewhere]),

@@ -200,6 +200,8 @@ QUANTITY = words_of(  # words for quantities of a machine
     "heading yaw pitch roll theta phi psi alpha beta gamma q dq qd x z omega distance displacement "
     "acceleration acc accel hohe weg pendulum cart room raum raumtemperatur hallentemperatur zulauftemperatur"
 )
+IN_UNITS = {"tension": ("", "V", "mV", "kV"), "wind": ("", "m/s", "km/h", "mph", "kn", "deg")}
+"""Units in which a word of these lists has its role: a tension in N is no voltage, a wind in rpm is a winder."""
 DRIVING_UNITS = frozenset(  # units of most inputs
     ("V", "mV", "kV", "%", "N m", "Nm", "mNm", "Ncm", "kNm", "N", "kN", "mN", "W", "kW")
 )
@@ -294,10 +296,13 @@ def role_said_by(column: str, unit: str = "", switches: bool = False) -> Role:
         ('set-point', 'command', 'answer')
         >>> role_said_by("heater", "%"), role_said_by("steering", "rad"), role_said_by("level", "V")
         ('actuator', '', 'quantity')
+        >>> role_said_by("tension", "V"), role_said_by("tension", "N"), role_said_by("n_wind", "rpm")
+        ('actuator', '', '')
     """
     written = _parted(name_and_unit(column)[0])[0]
     words = [re.sub(r"(?<=.)\d+$", "", _plain(word)) for word in written]
     whole = frozenset(words) | {"".join(pair) for pair in pairwise(words)}
+    whole -= {word for word, units in IN_UNITS.items() if unit not in units}
     if switches and whole & FLAG:
         return "flag"
     if whole & SET_POINT:

@@ -331,7 +331,8 @@ class _Explain:
             outcome = "worse"  # no alternative: it contains the added term
         elif chosen is not None and one.held_out.ratio < WORTH:
             between = self.evidence.compared(one.squares, chosen.squares, 1)
-            outcome = "alternative" if between.lower <= 1.0 else "worse"
+            # nearly equal errors are alternatives even if one is surely smaller
+            outcome = "alternative" if between.lower <= 1.0 or between.ratio <= 1.0 / WORTH else "worse"
             reason = f"the error ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
         elif one.held_out.ratio < 1.0:
             outcome = "unsure"

@@ -344,23 +344,24 @@ def test_the_delay_that_the_recordings_show_is_part_of_the_margin():
 
 def test_inputs_that_act_as_late_as_the_recordings_show_are_a_doubt_if_the_loop_swings():
     kit = kit_of(tank())
-    point, prior = point_of(kit), kit.models["prior"]
-    shown = p.late_inputs(point, prior)
+    point = point_of(kit)
+    shown = p.late_inputs(kit, point)
     assert (shown.verdict, shown.remedy) == ("shown", "")
     assert "level by 5 m" in shown.evidence
     assert "1 period late" in shown.evidence
-    late = p.late_inputs(point, prior, lacking_s=0.3)
+    late = p.late_inputs(kit, point, lacking_s=0.3)
     assert late.verdict == "doubted"
     assert "3 periods late: level" in late.evidence
     assert late.evidence.endswith("inputs act 0.3 s later than in the prior")
     # the remedy's weights keep the promise
     (weight,) = re.findall(r"r_delta=\(([0-9.]+),\)", late.remedy)
     cautious = OCP(20, [0.0], [0.0], [float(weight)], [-1.0], [1.0], q_y=[10.0])
-    slower = p.late_inputs(point_of(kit_of(tank(), cautious)), prior, lacking_s=0.3)
+    with_weight = kit_of(tank(), cautious)
+    slower = p.late_inputs(with_weight, point_of(with_weight), lacking_s=0.3)
     assert (slower.verdict, slower.remedy) == ("shown", "")
-    assert p.late_inputs(point, prior, lacking_s=2.0).remedy == p.LATE  # no weight is large enough
+    assert "r_delta" not in p.late_inputs(kit, point, lacking_s=2.0).remedy  # no weight is large enough
     unstable = kit_of(tank(a=1.5), OCP(60, [0.0], [0.0], [0.1], [-1.0], [1.0], q_y=[10.0]))
-    assert p.late_inputs(point_of(unstable), unstable.models["prior"]).verdict == "not promised"
+    assert p.late_inputs(unstable, point_of(unstable)).verdict == "not promised"
 
 
 def test_a_hard_bound_that_no_plan_keeps_is_a_doubt():

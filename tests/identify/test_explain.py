@@ -481,6 +481,20 @@ def test_a_further_parameter_must_gain_as_much_as_a_further_term(worse, simple):
 
 
 @pytest.mark.parametrize(
+    ("ratio", "lower", "outcome"),
+    [(1.02, 1.01, "alternative"), (1.2, 0.9, "alternative"), (1.2, 1.1, "worse")],
+)
+def test_alternatives_are_nearly_equal_or_not_surely_worse(ratio, lower, outcome):
+    pool = [
+        terms.input_gain(name, Parameter(f"g_{name}", 0.0, "-", -0.5, 0.5)) for name in ("torque", "other")
+    ]
+    error = HeldOutError(0.1, 0.5, 0.4, 0.6, 0.0)
+    added, tied = (FittedCandidate((form,), error, np.zeros(1), np.zeros(1)) for form in pool)
+    evidence = SimpleNamespace(compared=lambda one, other, n: replace(error, ratio=ratio, lower=lower))
+    assert _Explain._trial(SimpleNamespace(evidence=evidence), tied, added).outcome == outcome
+
+
+@pytest.mark.parametrize(
     ("ratio", "outcome", "words"),
     [
         (0.97, "unsure", "not significantly better"),
