@@ -116,8 +116,8 @@ class Trial:
     Args:
         terms: The candidate's terms: one, or a pair.
         outcome: ``"added"``; ``"alternative"``: the error is less than 5 % larger than with the added terms, or not
-            significantly larger; ``"unsure"``: the error is smaller, but not significantly; ``"worse"``: the error is not
-            smaller, or larger than with the added terms; ``"diverged"``: the fit failed.
+            significantly larger; ``"unsure"``: smaller, but not significantly; ``"worse"``: not smaller, or larger than
+            with the added terms; ``"diverged"``: the fit failed.
         held_out: Error over held-out data; None if the fit failed or did not reduce the error over all data.
         reason: Why the candidate was not added; empty if it was.
         short: Error over short held-out runs; None if the longer runs suffice.
