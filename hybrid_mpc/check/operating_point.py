@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations, islice
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,8 @@ Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 SHOWN, WRITTEN = 6, 10
 """Significant digits of a point in a message and in a file."""
+MOST = 20
+"""Most choices of held outputs that are tried."""
 
 
 def drift_at_rest(prior: Prior, second: float) -> str:
@@ -50,6 +54,25 @@ def holding_input(prior: Prior) -> OperatingPoint | None:
     return _search(prior, _places_of_inputs(prior))
 
 
+def held_outputs(prior: Prior) -> tuple[OperatingPoint, tuple[str, ...]] | None:
+    """An equilibrium with the operating point's values of as many outputs as there are inputs, else of fewer, and the
+    names of these outputs; None if there is none within the ranges. An output that shows one state can be held.
+    """
+    x, u, w = rest_of(prior)
+    by_x = output_slope(prior.equations)(x, u, w, prior.p)[1].full()
+    shown = [
+        (signal.name, int(np.flatnonzero(row)[0]))
+        for signal, row in zip(prior.outputs, by_x, strict=True)
+        if np.flatnonzero(row).size == 1
+    ]
+    for count in range(min(len(u), len(shown)), 0, -1):
+        for some in islice(combinations(shown, count), MOST):
+            free = np.delete(np.arange(len(x) + len(u)), [state for _, state in some])
+            if (point := _search(prior, free)) is not None:
+                return point, tuple(name for name, _ in some)
+    return None
+
+
 def _places_of_inputs(prior: Prior) -> Places:
     """Places of the inputs, and of the states of terms, in ``(x, u)``."""
     own = len(getattr(type(prior), "base", type(prior)).states)
@@ -57,8 +80,10 @@ def _places_of_inputs(prior: Prior) -> Places:
 
 
 def steady_point(prior: Prior) -> OperatingPoint | None:
-    """Equilibrium that replaces an operating point that is not one: its states with the input that holds them, else the
-    steady states under its input, else the nearest equilibrium; None if none is found.
+    """Equilibrium that replaces an operating point that is not one; None if none is found.
+
+    It has the point's states with the input that holds them, else its values of as many outputs as there are inputs,
+    else the steady states under its input, else it is the nearest one.
 
     Example:
         >>> class Tank(Prior):
@@ -70,8 +95,11 @@ def steady_point(prior: Prior) -> OperatingPoint | None:
         >>> steady_point(Tank()), held_states(Tank())
         (OperatingPoint(x=(1.0,), u=(0.5,), w=()), OperatingPoint(x=(0.6,), u=(0.3,), w=()))
     """
-    both = np.arange(len(prior.states) + len(prior.inputs))
-    return holding_input(prior) or held_states(prior) or _search(prior, both)
+    if (point := holding_input(prior)) is not None:
+        return point
+    if (found := held_outputs(prior)) is not None:
+        return found[0]
+    return held_states(prior) or _search(prior, np.arange(len(prior.states) + len(prior.inputs)))
 
 
 def both_ways(prior: Prior) -> str:
@@ -101,15 +129,10 @@ def _why_not_held(prior: Prior) -> str:
         f"none, even without limits: {counted(len(prior.inputs), 'input')} cannot make "
         f"{counted(len(prior.states), 'rate')} zero at these states"
     )  # fmt: skip
-    x, u, w = rest_of(prior)
-    by_x = output_slope(prior.equations)(x, u, w, prior.p)[1].full()
-    for signal, row in zip(prior.outputs, by_x, strict=True):
-        # an output that shows one state keeps its value if this state is held
-        if np.flatnonzero(row).size == 1:
-            free = np.delete(np.arange(len(x) + len(u)), np.flatnonzero(row))
-            if (point := _search(prior, free)) is not None:
-                return f"{text}. Steady state at your {signal.name}: x = {_numbers(point.x)}, u = {_numbers(point.u)}"
-    return text
+    if (found := held_outputs(prior)) is None:
+        return text
+    point, names = found
+    return f"{text}. Steady state at your {' and '.join(names)}: x = {_numbers(point.x)}, u = {_numbers(point.u)}"
 
 
 def sizes_of(signals: tuple[Signal, ...], at: Array) -> Array:

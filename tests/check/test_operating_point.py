@@ -7,6 +7,7 @@ from hybrid_mpc import InputError, OperatingPoint, Parameter, Prior, Signal, ext
 from hybrid_mpc.check.operating_point import (
     both_ways,
     drift_at_rest,
+    held_outputs,
     held_states,
     holding_input,
     place_of,
@@ -54,6 +55,24 @@ def test_what_the_inputs_cannot_hold_moves_to_the_states_that_they_hold():
     assert "Steady state at your one: x = [1.0, 1.0], u = [0.5]" in both_ways(Two())
     np.testing.assert_allclose(steady_point(Two()).x, [1.0, 1.0])
     assert steady_point(Two()).u == (0.5,)
+
+
+def test_as_many_outputs_are_held_as_there_are_inputs():
+    """Two levels with an inflow each follow their inputs; the third one shows the first two."""
+
+    class Three(Prior):
+        states = outputs = tuple(Signal(name, "m", 0.0, 2.0) for name in ("one", "two", "sum"))
+        inputs, parameters = (INFLOW, Signal("other", "m/s", 0.0, 1.0)), ()
+        operating_point = OperatingPoint((1.0, 0.5, 0.2), (0.1, 0.1))
+
+        def xdot(self, x, u, w, p):
+            return u.inflow - 0.5 * x.one, u.other - 0.5 * x.two, 0.5 * (x.one + x.two) - x.sum
+
+    point, names = held_outputs(Three())
+    assert names == ("one", "two")
+    np.testing.assert_allclose([*point.x, *point.u], [1.0, 0.5, 0.75, 0.5, 0.25])
+    assert "Steady state at your one and two: x = [1.0, 0.5, 0.75], u = [0.5, 0.25]" in both_ways(Three())
+    assert steady_point(Three()) == point
 
 
 def test_an_input_beyond_its_range_holds_nothing():
