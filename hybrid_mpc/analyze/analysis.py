@@ -29,9 +29,11 @@ from hybrid_mpc.analyze.margins import (
     GainSchedule,
     LinearLoop,
     Margins,
+    MpcGain,
     gain_schedule,
     mpc_gain,
     mpc_loop,
+    solved_gain,
     steady_filter,
 )
 from hybrid_mpc.analyze.measured import (
@@ -588,7 +590,7 @@ def loops_of(
     for (name, mode), ekf in given.filters.items():
         model, (x, h), u = given.models[name], points[name], given.models[name].u0
         for point in made[name]:
-            gain = mpc_gain(controllers[name], x, u, h, system=made[name][point])
+            gain = _gain(controllers[name], x, u, h, made[name][point])
             steady = steady_filter(ekf, x, u, h, system=made[name][point])
             for machine in (plant for own, plant in around if own == name):
                 loop = mpc_loop(gain, steady, made[machine][point])
@@ -597,6 +599,14 @@ def loops_of(
                     own = gain.by_state[:, : model.n_x], model.dt, machine_second(model.dt, model.time_unit)
                     rows[f"{mode}{at_input(model, signal)}"] = _loop(loop, j, *own)
     return found
+
+
+def _gain(controller: CondensedController, x: Array, u: Array, h: Array, system: Any) -> MpcGain:
+    """Gain of the MPC at a point: of its QP; of its solves if outputs have weights, or the cost is economic."""
+    ocp = controller.ocp
+    if ocp.economic is None and not ocp.n_y:
+        return mpc_gain(controller, x, u, h, system=system)
+    return solved_gain(controller, x, u, controller.problem.standing()[0], h)
 
 
 def at_input(model: HybridModel, signal: Signal) -> str:

@@ -193,6 +193,25 @@ def test_the_command_analyses_prior_and_hybrid_with_their_loops(golf_artifact, t
     assert len(list((out / "figures").glob("*.png"))) == 14
 
 
+def test_loops_of_problems_with_weights_on_outputs_are_those_of_the_same_weights_on_states(
+    golf_artifact, tmp_path
+):
+    """The angle is the rig's output: a weight on it is a weight on the state."""
+    given, _ = analysis_input(AnalysisSettings(noisy(golf_artifact, tmp_path), "golf_robot"))
+    filters = {key: f for key, f in given.filters.items() if key == ("prior", "quiet")}
+    given = replace(given, models={"prior": given.models["prior"]}, filters=filters)
+    problem = scenario.control.changed(du_max=None, r=(1e-3,))
+    by_state, by_output = (
+        loops_of(replace(given, ocp=ocp), {"prior": (np.zeros(2), np.zeros(0))})["prior on prior"]["rest"][
+            "quiet"
+        ]
+        for ocp in (problem.changed(q=(1e4, 0.0)), problem.changed(q=(0.0, 0.0), q_y=(1e4,)))
+    )
+    assert by_output.stable
+    # differences of solves are exact to about 1e-6; the problems' terminal weights differ slightly
+    np.testing.assert_allclose(by_output.gain, by_state.gain, rtol=0.02)
+
+
 @pytest.mark.full
 def test_the_delay_that_the_margins_allow_is_the_delay_that_the_rig_stands(golf_artifact, tmp_path):
     folder = noisy(golf_artifact, tmp_path)
