@@ -14,6 +14,7 @@ from hybrid_mpc.model.equilibrium import (
     SteadySearch,
     fixed_point,
     hidden_equilibrium,
+    holding,
     rate_search,
     residual_of,
     rest_search,
@@ -160,3 +161,13 @@ def test_states_are_searched_in_their_own_sizes():
     assert found.steady
     assert found.sure
     assert residual_of(one, found.v) <= RESIDUAL
+
+
+def test_the_best_input_is_finite_if_two_inputs_have_the_same_effect():
+    """A room that a heater warms and a second one, too: no rate tells them apart."""
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u", 2)
+    rates = ca.vertcat((u[0] + u[1] - x[0]) / 500.0, (x[0] - x[1]) / 5000.0)
+    best = holding(rates, u, np.array([0.5, 0.0]), np.array([50.0, 40.0]), np.array([100.0, 100.0]))
+    found = ca.Function("best", [x], [best])([2.0, 2.0]).full().ravel()
+    # the step from the operating point's input is the shortest one; damping of 1e-10
+    np.testing.assert_allclose(found, [1.25, 0.75], atol=1e-8)

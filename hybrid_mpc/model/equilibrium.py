@@ -674,8 +674,10 @@ def holding(rates: Expression, u: Expression, u0: Array, sizes: Array, scale: Ar
     size, rates = ca.DM(scale), rates / ca.DM(sizes)
     slope = ca.jacobian(rates, u) @ ca.diag(size)
     square = slope.T @ slope
-    damping = (1e-12 * ca.trace(square) + 1e-300) * ca.DM.eye(u.numel())
-    best = u - size * ca.solve(square + damping, slope.T @ rates)
+    # of size one, and damped: CasADi's QR refuses pivots below 1e-12, as those of two inputs with the same effect
+    weight = ca.trace(square) + 1e-300
+    damped = square / weight + 1e-10 * ca.DM.eye(u.numel())
+    best = u - size * ca.solve(damped, slope.T @ rates / weight)
     return ca.densify(ca.substitute(best, u, ca.DM(u0)))
 
 
