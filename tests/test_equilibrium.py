@@ -169,5 +169,5 @@ def test_the_best_input_is_finite_if_two_inputs_have_the_same_effect():
     rates = ca.vertcat((u[0] + u[1] - x[0]) / 500.0, (x[0] - x[1]) / 5000.0)
     best = holding(rates, u, np.array([0.5, 0.0]), np.array([50.0, 40.0]), np.array([100.0, 100.0]))
     found = ca.Function("best", [x], [best])([2.0, 2.0]).full().ravel()
-    # the step from the operating point's input is the shortest one; damping of 1e-10
-    np.testing.assert_allclose(found, [1.25, 0.75], atol=1e-8)
+    # the step from the operating point's input is the shortest one; a condition of 1e10 leaves six digits
+    np.testing.assert_allclose(found, [1.25, 0.75], atol=1e-5)

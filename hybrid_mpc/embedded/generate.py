@@ -52,9 +52,8 @@ SEARCH: Mapping[str, tuple[str, str]] = {
     "STEADY": (repr(equilibrium.STEADY), "1e-5"), "STILL": (repr(equilibrium.STILL), "1e-4"),
     "NEAR": (repr(equilibrium.NEAR), "1e-3"), "REACHED": (repr(equilibrium.REACHED), "1e-3"),
     "RANK": (repr(equilibrium.RANK), "1e-5"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
-    **{name: (repr(value), repr(value)) for name, value in (
-        ("STALLED", equilibrium.STALLED), ("CONTRACTS", equilibrium.CONTRACTS), ("FOLLOWED", equilibrium.FOLLOWED),
-        ("LEAST_PART", equilibrium.LEAST_PART), ("EQUAL", equilibrium.EQUAL),
+    **{name: (repr(getattr(equilibrium, name)),) * 2 for name in (
+        "STALLED", "CREEPS", "CONTRACTS", "FOLLOWED", "LEAST_PART", "LEAST_WEIGHT", "EQUAL",
     )}, "VIOLATED": ("1e-12", "1e-6"),
     "ROUNDING": ("1e-15", "1e-7"), "AWAY": (repr(equilibrium.AWAY), repr(equilibrium.AWAY)),
 }  # fmt: skip

@@ -32,9 +32,12 @@ RANK = 1e-9
 """Singular values below this share of the largest count as zero."""
 FREE = 1e-6
 """Weight of the distance from the operating point along directions that do not affect the outputs."""
-STALLED, WITHIN = 0.9, 5
-"""A descent is stopped if its residual has not fallen to the share ``STALLED`` within ``WITHIN`` steps; successful
-descents fall far more."""
+STALLED, CREEPS, WITHIN = 0.9, 0.99, 5
+"""A descent stops if within ``WITHIN`` steps its residual has not fallen to the share ``STALLED``, nor its merit to
+the share ``CREEPS``. Successful descents fall far more, but along a curved branch, as that of a saturating actuator,
+steps are short at first."""
+LEAST_WEIGHT = 100.0
+"""Smallest weight of the residual, over that of the deviation from the set-point, in the merit of a descent."""
 AWAY = 1e6
 """Distance from its start, in scales of the unknowns, at which a descent has diverged."""
 STILL = 1e-6
@@ -211,8 +214,8 @@ class Descent(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """A point of a descent: ``rest`` and ``y`` with Jacobians; ``lacks``, the scaled norm of ``rest``; and ``merit``,
-    which a descent reduces: ``lacks`` plus, with less weight, the weighted deviation of ``y``.
+    """A point of a descent: ``rest`` and ``y`` with Jacobians; ``lacks``, the scaled norm of ``rest``; and ``off``, the
+    weighted deviation of ``y``.
     """
 
     v: Array
@@ -221,7 +224,12 @@ class _Point(NamedTuple):
     y: Array
     y_by_v: Array
     lacks: float
-    merit: float
+    off: float
+
+    def merit(self, weight: float) -> float:
+        """What a descent reduces, with the weight of ``lacks``; infinite if a value is not finite."""
+        found = weight * self.lacks + self.off
+        return found if np.isfinite(found) else np.inf
 
 
 class SteadySearch:
@@ -291,7 +299,7 @@ class SteadySearch:
     def descend(self, v: Array, goal: Array, bounded: bool = True) -> Descent:
         """Gauss-Newton from ``v`` to the set-point ``goal`` ``(n_y,)``; not ``bounded``: only kept bounds hold."""
         at, done, sure = self._point(v, goal), False, True
-        lacks, before = [at.lacks], np.inf
+        passed, before, weight = [at], np.inf, LEAST_WEIGHT
         slopes = np.full((self._tracked.size, self._leans.size), np.nan)
         for _ in range(ITERATIONS):
             step, slopes = self._newton(at, goal, bounded)
@@ -301,31 +309,38 @@ class SteadySearch:
             if size <= self._steady:
                 done = at.lacks <= STILL
                 break
+            # exact penalty: the step must reduce the merit to first order (Nocedal, Wright, 2006, section 18.3)
+            worse = self._deviation(at.y + at.y_by_v @ step, goal) - at.off
+            weight = max(weight, 2.0 * worse / at.lacks) if at.lacks > STILL else weight
             sure = sure and (size < NEAR or size <= CONTRACTS * before)
-            before, share = size, 1.0
+            before, share, merit = size, 1.0, at.merit(weight)
             after = self._settled(at.v + step, goal)
-            if not after.merit < at.merit and size >= NEAR:
+            if not after.merit(weight) < merit and size >= NEAR:
                 # watchdog: on a curved branch a step leaves it to second order, and the next step returns to it
                 second = self._newton(after, goal, bounded)[0]
                 again = np.inf if second is None else float(np.max(np.abs(second / self.scale), initial=0.0))
                 if second is not None and np.isfinite(again):
                     then = self._settled(after.v + second, goal)
-                    if then.merit < at.merit:
+                    if then.merit(weight) < merit:
                         sure = sure and (again < NEAR or again <= CONTRACTS * size)
                         after, before = then, again
             # smallest share of a step that is tried
-            while not after.merit < at.merit and share > 1e-3:
+            while not after.merit(weight) < merit and share > 1e-3:
                 share, sure = 0.5 * share, sure and size < NEAR
                 after = self._settled(at.v + share * step, goal)
-            if not after.merit < at.merit:
+            if not after.merit(weight) < merit:
                 done = size < NEAR and at.lacks <= STILL  # only rounding is left
                 break
             at = after
-            lacks.append(at.lacks)
+            passed.append(at)
             if np.max(np.abs((at.v - v) / self.scale), initial=0.0) > AWAY:
                 break
-            if len(lacks) > WITHIN and at.lacks > max(STALLED * lacks[-1 - WITHIN], STILL):
-                break
+            if len(passed) > WITHIN:
+                past = passed[-1 - WITHIN]
+                if at.lacks > max(STALLED * past.lacks, STILL) and at.merit(weight) > CREEPS * past.merit(
+                    weight
+                ):
+                    break
         off = float(np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0))
         return Descent(at.v, at.y, off, slopes, done, done and sure)
 
@@ -456,15 +471,18 @@ class SteadySearch:
             v = at.v.copy()
             v[hidden] += move
             at = self._point(v, goal)
-        return at if at.merit < plain.merit else plain
+        return at if at.merit(LEAST_WEIGHT) < plain.merit(LEAST_WEIGHT) else plain
 
     def _point(self, v: Array, goal: Array) -> _Point:
-        """The data of a point; the merit is infinite if a value is not finite."""
+        """The data of a point."""
         rest, rest_by_v = self.equations.rest(v)
         y, y_by_v = self.equations.shown(v)
         lacks = float(np.sum(np.abs(rest / self.size)))
-        merit = 100.0 * lacks + float(np.linalg.norm(self._root * (y - goal)[self._tracked]))
-        return _Point(v, rest, rest_by_v, y, y_by_v, lacks, merit if np.isfinite(merit) else np.inf)
+        return _Point(v, rest, rest_by_v, y, y_by_v, lacks, self._deviation(y, goal))
+
+    def _deviation(self, y: Array, goal: Array) -> float:
+        """Weighted deviation of the outputs from the set-point."""
+        return float(np.linalg.norm(self._root * (y - goal)[self._tracked]))
 
 
 def natural_sizes(model: HybridModel) -> Array:

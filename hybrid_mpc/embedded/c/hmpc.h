@@ -134,9 +134,9 @@ typedef struct {
 } hmpc_target;
 
 /* A point of the search for a steady state: v = (z, u), residual F(z, u) - z, Jacobian of the model, outputs; lacks:
-   size of the residual; merit: function that a descent reduces. */
+   size of the residual; off: weighted deviation of the outputs from the set-point. */
 typedef struct {
-  hmpc_real v[HMPC_NT], rest[HMPC_NZ], slope[HMPC_NZ][HMPC_LJ], y[HMPC_NY], lacks, merit;
+  hmpc_real v[HMPC_NT], rest[HMPC_NZ], slope[HMPC_NZ][HMPC_LJ], y[HMPC_NY], lacks, off;
 #if HMPC_CURVED
   hmpc_real by_x[HMPC_NY][HMPC_NX], by_u[HMPC_NY][HMPC_NU]; /* derivatives of nonlinear outputs */
 #endif

@@ -26,7 +26,7 @@ enum {
   ROUNDS = 10 * HMPC_TARGET_ROWS
 };
 
-/* Residual, outputs, derivatives and merit at v. */
+/* Residual, outputs and derivatives at v. */
 static void look(const hmpc_state *s, const real *v, const real *goal, const real *w, hmpc_point *p) {
   real acts[HMPC_NU], z[HMPC_LZ] = {R(0.0)}, next[HMPC_LZ] = {R(0.0)}, off = R(0.0);
   memcpy(p->v, v, sizeof p->v);
@@ -52,8 +52,26 @@ static void look(const hmpc_state *s, const real *v, const real *goal, const rea
     for (int j = 0; j < HMPC_ND; ++j) p->y[i] += disturbs_y[i][j] * s->search.d[j];
     if (q_y[i] > R(0.0)) off += target_root[i] * target_root[i] * (p->y[i] - goal[i]) * (p->y[i] - goal[i]);
   }
-  p->merit = R(100.0) * p->lacks + hmpc_sqrt(off);
-  if (!hmpc_finite(p->merit)) p->merit = R(INFINITY);
+  p->off = hmpc_sqrt(off);
+}
+
+/* Function that a descent reduces, with the weight of the residual; infinite if a value is not finite. */
+static real merit(const hmpc_point *p, real weight) {
+  const real found = weight * p->lacks + p->off;
+  return hmpc_finite(found) ? found : R(INFINITY);
+}
+
+/* Weighted deviation of the outputs from the set-point after a step, to first order. */
+static real deviation(const hmpc_point *p, const real *step, const real *goal) {
+  real off = R(0.0);
+  for (int i = 0; i < HMPC_NY; ++i) {
+    real y = p->y[i];
+    if (!(q_y[i] > R(0.0))) continue;
+    for (int j = 0; j < HMPC_NX; ++j) y += OUTPUT_X(p)[i][j] * step[j];
+    for (int j = 0; j < HMPC_NU; ++j) y += OUTPUT_U(p)[i][j] * step[HMPC_NZ + j];
+    off += target_root[i] * target_root[i] * (y - goal[i]) * (y - goal[i]);
+  }
+  return hmpc_sqrt(off);
 }
 
 #if HMPC_NH > 0
@@ -110,7 +128,7 @@ static void settle(hmpc_state *s, const real *v, const real *goal, const real *w
     for (int i = 0; i < HMPC_NH; ++i) there[HMPC_NX + i] += size[i] * move[i];
     look(s, there, goal, w, at);
   }
-  if (work->settled.merit < to->merit) *to = work->settled;
+  if (merit(&work->settled, HMPC_TARGET_LEAST_WEIGHT) < merit(to, HMPC_TARGET_LEAST_WEIGHT)) *to = work->settled;
 #endif
 }
 
@@ -420,12 +438,15 @@ static void place(const hmpc_steady *from, real *v) {
 static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_descent *found) {
   hmpc_search *const work = &s->search;
   hmpc_point *const at = &work->at, *const after = &work->after;
-  real step[NT], there[NT], lacks[HMPC_TARGET_ITERATIONS + 1], before = HMPC_HUGE, off = R(0.0), apart = R(0.0);
+  real step[NT], there[NT], before = HMPC_HUGE, off = R(0.0), apart = R(0.0);
+  real lacks[HMPC_TARGET_ITERATIONS + 1], offs[HMPC_TARGET_ITERATIONS + 1];
+  real weight = HMPC_TARGET_LEAST_WEIGHT;
   int done = 0, sure = 1;
   look(s, v, goal, w, at);
   lacks[0] = at->lacks;
+  offs[0] = at->off;
   for (int k = 1; k <= HMPC_TARGET_ITERATIONS; ++k) {
-    real size = R(0.0), share = R(1.0);
+    real size = R(0.0), share = R(1.0), from;
     if (!newton(work, goal, bounded, step)) break;
     for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs(step[i] / target_scale[i]));
     if (size <= HMPC_TARGET_STEADY) {
@@ -434,9 +455,13 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
     }
     if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * before)) sure = 0;
     before = size;
+    /* exact penalty: the step must reduce the merit to first order */
+    if (at->lacks > HMPC_TARGET_STILL)
+      weight = hmpc_max(weight, R(2.0) * (deviation(at, step, goal) - at->off) / at->lacks);
+    from = merit(at, weight);
     for (int i = 0; i < NT; ++i) there[i] = at->v[i] + step[i];
     settle(s, there, goal, w, after);
-    if (!(after->merit < at->merit) && !(size < HMPC_TARGET_NEAR)) {
+    if (!(merit(after, weight) < from) && !(size < HMPC_TARGET_NEAR)) {
       /* watchdog: on a curved branch a step has an error of second order, which the next step corrects */
       const real answer = work->answer;
       real second[NT], again = R(0.0);
@@ -446,7 +471,7 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
         for (int i = 0; i < NT; ++i) again = hmpc_max(again, hmpc_abs(second[i] / target_scale[i]));
         for (int i = 0; i < NT; ++i) there[i] = at->v[i] + second[i];
         settle(s, there, goal, w, after);
-        if (after->merit < work->kept.merit) {
+        if (merit(after, weight) < from) {
           if (!(again < HMPC_TARGET_NEAR || again <= HMPC_TARGET_CONTRACTS * size)) sure = 0;
           before = again;
         }
@@ -454,23 +479,27 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       *at = work->kept;
       work->answer = answer;
     }
-    for (int half = 0; half < HALVINGS && !(after->merit < at->merit); ++half) {
+    for (int half = 0; half < HALVINGS && !(merit(after, weight) < from); ++half) {
       share *= R(0.5);
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
       if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
-    if (!(after->merit < at->merit)) { /* only rounding errors remain, or there is no progress */
+    if (!(merit(after, weight) < from)) { /* only rounding errors remain, or there is no progress */
       done = size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
       break;
     }
     *at = *after;
     lacks[k] = at->lacks;
+    offs[k] = at->off;
     size = R(0.0);
     for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs((at->v[i] - v[i]) / target_scale[i]));
     if (size > HMPC_TARGET_AWAY) break;
     if (k < HMPC_TARGET_WITHIN) continue;
-    if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[k - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL)) break;
+    if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[k - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL) &&
+        merit(at, weight) >
+            HMPC_TARGET_CREEPS * (weight * lacks[k - HMPC_TARGET_WITHIN] + offs[k - HMPC_TARGET_WITHIN]))
+      break;
   }
   for (int i = 0; i < HMPC_NY; ++i)
     if (q_y[i] > R(0.0)) off = hmpc_max(off, target_root[i] * hmpc_abs(at->y[i] - goal[i]));
