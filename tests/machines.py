@@ -1,5 +1,7 @@
 """Small machines that are no pendulum: rest that is not zero, several inputs and outputs, measured disturbances."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 from online_models import StatePlant, rk4
@@ -109,3 +111,16 @@ class MachinePlant(StatePlant):
         m = self._model
         y = m.output(state, getattr(self, "_u", m.u0), getattr(self, "_w", m.w), m.p).full().ravel()
         return y + self._offset + self._sigma * rng.normal(size=m.n_y)
+
+
+def ventilated():
+    """A sunny room cooled by a vent: its effect saturates, and a motor opens it in minutes."""
+    x, u, w = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("w", 2)
+    exchange = 0.55 + 0.043 * x[1] / ca.sqrt(1.0 + 0.0017 * x[1] ** 2)
+    xdot = ca.vertcat((0.015 * w[1] - exchange * (x[0] - w[0])) / 1200.0, (u - x[1]) / 150.0)
+    air, percent = Signal("T", "degC", -5.0, 45.0), Signal("vent", "%", 0.0, 100.0)
+    return HybridModel.of(
+        "room", 120.0, (air, replace(percent, name="opening")), (percent,), (air,), x=x, u=u, w=w, y=x[0],
+        x_next=x + 120.0 * xdot, xdot=xdot, disturbances=(Signal("out", "degC"), Signal("sun", "W/m^2")),
+        nominal_w=(15.0, 300.0), nominal_x=(18.7084, 20.0), nominal_u=(20.0,),
+    )  # fmt: skip

@@ -1,8 +1,7 @@
 """The target calculator, and problems that weigh outputs, on machines whose rest is not zero."""
 
-from dataclasses import replace
-
 import casadi as ca
+import machines
 import numpy as np
 import pytest
 from control_parts import plan_of
@@ -384,23 +383,10 @@ def test_rounding_does_not_choose_among_several_steady_states(seed):
     assert spread() < 1e-9
 
 
-def ventilated():
-    """A sunny room cooled by a vent: its effect saturates, and a motor opens it in minutes."""
-    x, u, w = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("w", 2)
-    exchange = 0.55 + 0.043 * x[1] / ca.sqrt(1.0 + 0.0017 * x[1] ** 2)
-    xdot = ca.vertcat((0.015 * w[1] - exchange * (x[0] - w[0])) / 1200.0, (u - x[1]) / 150.0)
-    air, percent = Signal("T", "degC", -5.0, 45.0), Signal("vent", "%", 0.0, 100.0)
-    return HybridModel.of(
-        "room", 120.0, (air, replace(percent, name="opening")), (percent,), (air,), x=x, u=u, w=w, y=x[0],
-        x_next=x + 120.0 * xdot, xdot=xdot, disturbances=(Signal("out", "degC"), Signal("sun", "W/m^2")),
-        nominal_w=(15.0, 0.0), nominal_x=(15.0, 0.0), nominal_u=(0.0,),
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("w", [(18.2, 278.0), (18.2, 362.0), (20.0, 400.0)])
 def test_an_actuator_that_saturates_gives_all_it_can(w):
     """Steps along the curved branch of its steady states are short at first."""
-    targets = Targets(ventilated(), OCP(30, [0.0, 0.0], [1e-6], [1e-2], [0.0], [100.0], q_y=[4.0]))
+    targets = Targets(machines.ventilated(), OCP(30, [0.0, 0.0], [1e-6], [1e-2], [0.0], [100.0], q_y=[4.0]))
     found = targets.at([18.0], w=w)
     exchange = 0.55 + 4.3 / np.sqrt(1.0 + 17.0)
     assert found.steady

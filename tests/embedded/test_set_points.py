@@ -94,6 +94,12 @@ def far_from_rest(seed):
     )
 
 
+def ventilated():
+    """A vent that saturates: far set-points are reached along a curved branch, or not at all."""
+    ocp = OCP(30, [0.0, 0.0], [1e-6], [1e-2], [0.0], [100.0], q_y=[4.0])
+    return machines.ventilated(), ocp, 3.0
+
+
 CASES = {
     "heaters": lambda: (*parts.heaters(), 8.0),
     "curved": lambda: (*parts.curved(), 8.0),
@@ -104,6 +110,7 @@ CASES = {
     "pumps": pumps,
     "two levels": two_levels,
     "sticking": sticking,
+    "saturating vent": ventilated,
     "restless": restless,
     "memory": memory,
     "begun at the run's end": lambda: far_from_rest(2),
