@@ -73,9 +73,9 @@ class Task:
         name: Short name, e.g. ``"track_sine"``, by the rules of a signal's; part of file names.
         title: One line for plots and the report.
         duration: Length [s].
-        x0: Initial state ``(n_x,)`` [SI], an equilibrium.
-        reference: ``t (n,) [s] -> x_ref (n, n_x)`` [SI], or ``y_ref (n, n_y)`` if the control problem weighs outputs;
-            the controller previews it if the problem says so.
+        x0: Initial state ``(n_x,)`` [units of the states], an equilibrium.
+        reference: ``t (n,) [s] -> x_ref (n, n_x)`` [likewise], or ``y_ref (n, n_y)`` if the control problem weighs
+            outputs; the controller previews it if the problem says so.
         weight: ``t (n,) [s] -> (n, n_x)``, nonnegative factors on the control problem's ``q``, previewed like the
             reference: zero where a state does not matter, large where it must be met. Instants must lie on the grid of
             model periods. Default: 1.

@@ -333,7 +333,8 @@ class _Explain:
             between = self.evidence.compared(one.squares, chosen.squares, 1)
             # nearly equal errors are alternatives even if one is surely smaller
             outcome = "alternative" if between.lower <= 1.0 or between.ratio <= 1.0 / WORTH else "worse"
-            reason = f"the error ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
+            said = f"the error ratio to the model with {chosen.forms[0].name} is {between.ratio:.2f}"
+            reason = f"{said}; {one.reason}" if one.reason else said
         elif one.held_out.ratio < 1.0:
             outcome = "unsure"
         return Trial(tuple(_found(form) for form in one.forms), outcome, one.held_out, reason, one.short)

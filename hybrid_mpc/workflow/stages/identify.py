@@ -407,8 +407,11 @@ def _wrong_terms(
     def searching(text: str) -> None:
         report(0, 1, f"looking for wrong terms: {text}")
 
+    def testing(text: str) -> None:
+        searching(f"testing '{text}'")
+
     searching("smoothing the recordings")
-    return named(causes(load_scenario(scenario).prior, fit.values, acting, dt, length, unit, searching))
+    return named(causes(load_scenario(scenario).prior, fit.values, acting, dt, length, unit, testing))
 
 
 def _each_recording(
