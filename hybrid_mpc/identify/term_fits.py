@@ -161,7 +161,7 @@ class TermFits:
         y = self.evidence.windows.y
         self.spread = np.array([robust_spread(c) or 1.0 for c in y.reshape(-1, y.shape[-1]).T])
         self._fits: dict[Terms, OutputFit] = {}
-        self._short_squares: dict[Terms, Array] = {}
+        self._short_squares: dict[tuple[Terms, bytes], Array] = {}
 
     def fit(self, terms: Terms) -> OutputFit:
         """The fit of the prior with terms."""
@@ -371,9 +371,10 @@ class TermFits:
 
     def _short(self, terms: Terms, theta: Array) -> Array:
         """Squared errors of held-out short runs with terms."""
-        if terms not in self._short_squares:
-            self._short_squares[terms] = self.held_out(self.short, terms, theta)
-        return self._short_squares[terms]
+        key = terms, theta.tobytes()
+        if key not in self._short_squares:
+            self._short_squares[key] = self.held_out(self.short, terms, theta)
+        return self._short_squares[key]
 
     def _at_bounds(self, terms: Terms, forms: Terms, theta: Array) -> list[str]:
         """Parameters of new terms that end at a bound; such a term replaces another effect."""
