@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from time import thread_time
 
 import numpy as np
@@ -849,23 +849,23 @@ def margins(
 
 
 def _margins_at(point: SetPoint) -> list[tuple[Signal, Margins]]:
-    loop = _linear_loop(point)
+    loop = _linear_loops(point)()
     return [(signal, loop.margins(j)) for j, signal in enumerate(point.model.inputs)]
 
 
 def _count_common_delay(point: SetPoint, most: float) -> int:
     """Largest whole delay [periods] of all inputs together, up to ``most``, at which the linearized loop is stable."""
-    every = range(1, math.floor(min(most, point.problem.horizon)) + 1)
-    return next((late - 1 for late in every if not _linear_loop(point, late).stable), len(every))
+    loop_with, every = _linear_loops(point), range(1, math.floor(min(most, point.problem.horizon)) + 1)
+    return next((late - 1 for late in every if not loop_with(delay=late).stable), len(every))
 
 
-def _linear_loop(point: SetPoint, late: int = 0) -> LinearLoop:
-    """The linearized loop of controller and quiet filter, with inputs ``late`` periods late."""
+def _linear_loops(point: SetPoint) -> Callable[..., LinearLoop]:
+    """The linearized loop of controller and quiet filter, as a function of the delay of all inputs [periods]."""
     model, (x, u) = point.model, point.rest
     h = hidden_fixed_point(model, x, u, w=point.w)
     gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.w)
     system = linearize(model, x, u, h)
-    return mpc_loop(gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system, delay=late)
+    return partial(mpc_loop, gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system)
 
 
 def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
@@ -937,7 +937,7 @@ def late_inputs(kit: Kit, point: SetPoint, lacking_s: float = 0.0) -> Promise | 
 
 
 def _with_change_weights(point: SetPoint, prior: HybridModel, factor: float) -> SetPoint:
-    """The same set-point with larger weights of input changes; inputs without one get ``factor`` times theirs."""
+    """The same set-point with ``factor`` times the weights of input changes; times ``r`` for an input without one."""
     problem = point.problem.changed(
         r_delta=factor * np.where(point.problem.r_delta > 0, point.problem.r_delta, point.problem.r)
     )

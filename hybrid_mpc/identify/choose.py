@@ -17,12 +17,11 @@ from scipy.stats import t as student
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.identify.evidence import HARM
 from hybrid_mpc.machine.specification import ChoiceRule
 
 Array = NDArray[np.float64]
 RULE = ChoiceRule()
-HARMFUL = 1.05
-"""Ratio of errors above which a hybrid is harmful."""
 
 
 @dataclass(frozen=True)
@@ -292,11 +291,8 @@ def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures, rule: Cho
     if not np.isfinite(own).all() or not np.isfinite(prior).all():
         return blocks
     n, each = len(own), 0.5 * np.log(np.maximum(own, 1e-300) / np.maximum(prior, 1e-300))
-    mean, most, harm = (
-        float(each.mean()),
-        math.inf,
-        1.0,
-    )  # no bound from two recordings: they may agree by chance
+    mean = float(each.mean())
+    most, harm = math.inf, 1.0  # no bound from two recordings: they may agree by chance
     if n >= rule.fewest:
         scatter = float(each.std(ddof=1)) / math.sqrt(n)
         most, harm = mean + float(student.ppf(rule.confidence, n - 1)) * scatter, _harm(mean, scatter, n)
@@ -306,5 +302,5 @@ def _by_recordings(own: Array, prior: Array, blocks: CandidateFigures, rule: Cho
 
 
 def _harm(mean: float, scatter: float, n: int) -> float:
-    """Probability that the logarithm of a ratio exceeds that of ``HARMFUL``, by Student's t with ``n - 1`` degrees."""
-    return float(student.cdf((mean - math.log(HARMFUL)) / max(scatter, 1e-12), n - 1))
+    """Probability that the logarithm of a ratio exceeds that of ``HARM``, by Student's t with ``n - 1`` degrees."""
+    return float(student.cdf((mean - math.log(HARM)) / max(scatter, 1e-12), n - 1))

@@ -29,7 +29,7 @@ ADDED = 0.85
 """Ratio of errors that a term must fall below to be added. Smaller held-out gains became harm on another recording as
 often as gain (docs/results/explain.md), and a term costs its reader attention."""
 HARM = 1.05
-"""Ratio of errors above which a term is harmful."""
+"""Ratio of errors above which a term or a network is harmful."""
 GAIN = 0.7
 """Lower limit of a recording's ratio of errors in the upper bound. It makes the bound larger, and a single recording
 with a large reduction does not widen the interval."""

@@ -337,9 +337,8 @@ class SteadySearch:
                 break
             if len(passed) > WITHIN:
                 past = passed[-1 - WITHIN]
-                if at.lacks > max(STALLED * past.lacks, STILL) and at.merit(weight) > CREEPS * past.merit(
-                    weight
-                ):
+                stalled = at.lacks > max(STALLED * past.lacks, STILL)
+                if stalled and at.merit(weight) > CREEPS * past.merit(weight):
                     break
         off = float(np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0))
         return Descent(at.v, at.y, off, slopes, done, done and sure)

@@ -223,11 +223,13 @@ class Search:
 
         warm_up = self.context.spec.warm_up
         to_fit = _ToFit(self.key, self.context.scenario_path, fit.values, known_, self.dt, length, warm_up)
-        with closing(make_engine(_answered, self.context.workers, self.context.cluster)) as engine:
+        with closing(
+            make_engine(partial(_answered, to_fit), self.context.workers, self.context.cluster)
+        ) as engine:
             found = search(
                 self.make, fit.values, known_, dt=self.dt, length=length, warm_up=warm_up, candidates=candidates,
                 own=self.chosen.own, begun=begun, most=self.most, on_progress=self._progress("candidates"),
-                on_step=keep, answers=partial(_answers, engine, to_fit),
+                on_step=keep, answers=partial(_answers, engine),
             )  # fmt: skip
         progress.finish(found.reason)
         self._keep("ended", {"found": found, "most": self.most})
@@ -296,7 +298,7 @@ class Search:
 
 @dataclass(frozen=True)
 class _ToFit:
-    """What another process needs to fit terms; equal if ``key`` is."""
+    """What another process needs to fit terms; ``key``, ``scenario`` and ``length`` determine the rest."""
 
     key: str
     scenario: str
@@ -317,27 +319,25 @@ def _fits(to_fit: _ToFit) -> TermFits:
     )  # fmt: skip
 
 
-def _answered(batch: tuple[int, _ToFit, Work]) -> Answer:
-    return _fits(batch[1]).answer(batch[2])
+def _answered(to_fit: _ToFit, batch: tuple[int, Work]) -> Answer:
+    return _fits(to_fit).answer(batch[1])
 
 
-def _answers(
-    engine: Engine[tuple[int, _ToFit, Work], Answer], to_fit: _ToFit, works: Sequence[Work]
-) -> Iterator[tuple[int, Answer]]:
+def _answers(engine: Engine[tuple[int, Work], Answer], works: Sequence[Work]) -> Iterator[tuple[int, Answer]]:
     """Index and answer of each candidate, as processes finish them.
 
     Raises:
         RuntimeError: If a process ends before its answer.
     """
-    for i, work in enumerate(works):
-        engine.submit((i, to_fit, work))
+    for batch in enumerate(works):
+        engine.submit(batch)
     left = len(works)
     while left:
         # time [s] between checks whether a cluster still has workers
         found = engine.next(timeout=1.0)
         if found is None:
             continue
-        (i, _, _), answer = found
+        (i, _), answer = found
         if isinstance(answer, Lost):
             raise RuntimeError(f"the process of a candidate ended: {answer}")
         left -= 1
