@@ -22,6 +22,7 @@ from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, tracked_range, with_tracked
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.kit.assembly import (
+    INPUT_NOISE,
     make_adaptive_guard,
     make_controller,
     make_estimator,
@@ -487,8 +488,9 @@ class Kit:
         return own.limits[kind]
 
     def observer(
-        self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching"
-    ) -> Filter:
+        self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching",
+        input_noise: float = INPUT_NOISE,
+    ) -> Filter:  # fmt: skip
         """The estimator of a model's state, hidden state and, with ``load``, unknown disturbances.
 
         Args:
@@ -496,6 +498,8 @@ class Kit:
             task: Task whose control problem determines the size of a load. Default: the common control problem.
             load: Whether it estimates a load; without this, a constant load causes an offset. Default: True.
             kind: ``"switching"``, ``"ekf"``, ``"ukf"`` or ``"mhe"`` (docs/observers.md). Default: switching.
+            input_noise: Noise that the filter assumes at the inputs, as a share of their ranges: more makes a loop
+                robust, less makes predictions exact. Default: 0.05; 0 without ``load``.
 
         Raises:
             InputError: If model, task or kind are unknown, or control problem or noise are missing.
@@ -503,7 +507,9 @@ class Kit:
         check_flag(load, "load")
         model = _named(model, "model") or self.recommended
         found, noise = self._model(model), self.noise(f"{model}_observer" if load else model)
-        return make_estimator(found, self, noise, self.problem(task), observer=load, kind=kind)
+        return make_estimator(
+            found, self, noise, self.problem(task), observer=load, kind=kind, input_noise=input_noise
+        )
 
     def tracking_observer(
         self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching"

@@ -171,7 +171,7 @@ def test_bad_input_speaks(models, use, code):
 
 def test_observer_and_parameter_filter_switch_by_the_same_numbers(adaptive, golf):
     sigma_x = np.array([1e-6, 1e-4])
-    observer = make_estimator(golf, load_scenario("golf_robot"), sigma_x)
+    observer = make_estimator(golf, load_scenario("golf_robot"), sigma_x, input_noise=0.0)
     adapting = parameter_filter(adaptive, 2, sigma_y=[1e-4], sigma_x=sigma_x, sigma_x0=[1e-4, 0.1])
     for several, transition in ((observer, with_outliers(SWITCHES)), (adapting, SWITCHES)):
         np.testing.assert_array_equal(several.transition, transition)
