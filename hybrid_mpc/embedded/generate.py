@@ -51,9 +51,9 @@ FIRST = 25
 SEARCH: Mapping[str, tuple[str, str]] = {
     "STEADY": (repr(equilibrium.STEADY), "1e-5"), "STILL": (repr(equilibrium.STILL), "1e-4"),
     "NEAR": (repr(equilibrium.NEAR), "1e-3"), "REACHED": (repr(equilibrium.REACHED), "1e-3"),
-    "RANK": (repr(equilibrium.RANK), "1e-5"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
+    "RANK": (repr(equilibrium.RANK), "1e-5"), "ASIDE": (repr(equilibrium.ASIDE), "1e-2"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
     **{name: (repr(getattr(equilibrium, name)),) * 2 for name in (
-        "STALLED", "CREEPS", "CONTRACTS", "FOLLOWED", "LEAST_PART", "LEAST_WEIGHT", "EQUAL",
+        "STALLED", "CREEPS", "CONTRACTS", "FOLLOWED", "LEAST_PART", "LEAST_WEIGHT", "EQUAL", "STIFF",
     )}, "VIOLATED": ("1e-12", "1e-6"),
     "ROUNDING": ("1e-15", "1e-7"), "AWAY": (repr(equilibrium.AWAY), repr(equilibrium.AWAY)),
 }  # fmt: skip
@@ -144,6 +144,7 @@ def make_sources(
         "SOFT_D": int(any(np.any(np.array(f.jac_sparsity(0, 2).get_triplet()[1]) < model.n_d) for f in soft.functions)),
         "TARGET_ITERATIONS": equilibrium.ITERATIONS, "TARGET_SETTLING": equilibrium.SETTLING,
         "TARGET_WITHIN": equilibrium.WITHIN, "TARGET_PARTS": equilibrium.MOST_PARTS, "TARGET_STARTS": len(aims),
+        "TARGET_WAIT": equilibrium.WAIT,
         "TARGET_NEAREST": len(aims) - 1 if problem.targets is not None and problem.targets.run_out else 0,
         "CURVED": int(curved), "STAGE_COST": int(staged), "COST_MOVES": int(staged and cost.n_p > 0),
         "OUTPUT_ROWS": int(ocp.n_y > 0 and not staged), "STARTS": len(ocp.starts),

@@ -338,18 +338,120 @@ static int least_squares(hmpc_search *work, int m, const real *g, int count, rea
   return 1;
 }
 
-/* Gauss-Newton step at work->at; 0 if its QP has no solution. */
-static int newton(hmpc_search *work, const real *goal, int bounded, real *step) {
+/* Scaled Jacobian of the steady-state equations at work->at, in work->a. */
+static void slopes_of_rest(hmpc_search *work) {
   const hmpc_point *const at = &work->at;
-  const real *const u = at->v + HMPC_NZ;
-  real onto[NT], sees[HMPC_NY][NT] = {{R(0.0)}}, error[HMPC_NY], g[NT], row[NT], eta[NT];
-  real trace = R(0.0), size = R(1e-30);
-  int order[HMPC_NZ], tracked = 0, count = 0;
   for (int i = 0; i < HMPC_NZ; ++i) {
     for (int j = 0; j < HMPC_NZ; ++j)
       work->a[i][j] = (at->slope[i][j] - (i == j ? R(1.0) : R(0.0))) * target_scale[j] / target_heed[i];
     for (int j = 0; j < HMPC_NU; ++j)
       work->a[i][HMPC_NZ + j] = at->slope[i][HMPC_LZ + j] * target_scale[HMPC_NZ + j] / target_heed[i];
+  }
+}
+
+/* Scaled derivative of output i by the unknown j. */
+static real slope_of_output(const hmpc_point *p, int i, int j) {
+  (void)p;
+  if (j < HMPC_NX) return OUTPUT_X(p)[i][j] * target_scale[j];
+  return j < HMPC_NZ ? R(0.0) : OUTPUT_U(p)[i][j - HMPC_NZ] * target_scale[j];
+}
+
+/* Whether the unknown j is at a bound, where it has a multiplier of its own. */
+static int at_bound(const hmpc_point *p, int j) {
+  const real near = HMPC_TARGET_NEAR * target_scale[j];
+  if (j >= HMPC_NX && j < HMPC_NZ) return 0;
+  const real low = j < HMPC_NX ? target_x_range[j][0] : u_min[j - HMPC_NZ];
+  const real high = j < HMPC_NX ? target_x_range[j][1] : u_max[j - HMPC_NZ];
+  return !(p->v[j] - low > near && high - p->v[j] > near);
+}
+
+/* Multipliers of the steady-state equations at work->at, in which the slope of the outputs' deviation vanishes. */
+static void multipliers(hmpc_search *work, const real *push, real *to) {
+  const hmpc_point *const at = &work->at;
+  real b[NT] = {R(0.0)};
+  int order[HMPC_NZ];
+  slopes_of_rest(work);
+  for (int j = 0; j < NT; ++j) {
+    const int held = at_bound(at, j);
+    for (int i = 0; i < HMPC_NZ && held; ++i) work->a[i][j] = R(0.0);
+    for (int i = 0; i < HMPC_NY && !held; ++i) b[j] -= push[i] * slope_of_output(at, i, j);
+  }
+  const int rank = factorize(work, order);
+  for (int k = 0; k < rank; ++k)
+    hmpc_add(b + k, -hmpc_dot(work->a[k] + k, b + k, NT - k) / work->half[k], work->a[k] + k, NT - k);
+  memset(to, 0, sizeof(real) * HMPC_NZ);
+  for (int i = rank - 1; i >= 0; --i) {
+    real value = b[i];
+    for (int j = i + 1; j < rank; ++j) value -= work->a[j][i] * to[order[j]];
+    to[order[i]] = value / work->diagonal[i];
+  }
+}
+
+/* Second derivatives of the Lagrangian along the m directions work->along, in work->bend, and their product with the
+   step onto the steady states, by differences of Jacobians. Returns the norm of the second derivatives. */
+static real bend(hmpc_state *s, const real *goal, const real *w, const real *pull, int m, const real *onto, real *turned) {
+  hmpc_search *const work = &s->search;
+  const hmpc_point *const at = &work->at, *const aside = &work->settled;
+  const real far = hmpc_sqrt(hmpc_dot(onto, onto, NT)) + R(1e-30);
+  real norm = R(0.0);
+  for (int k = 0; k <= m; ++k) {
+    real v[NT], change[NT];
+    for (int j = 0; j < NT; ++j)
+      v[j] = at->v[j] + HMPC_TARGET_ASIDE * (k < m ? work->along[k][j] : onto[j] / far) * target_scale[j];
+    look(s, v, goal, w, &work->settled);
+    for (int j = 0; j < NT; ++j) {
+      const int column = j < HMPC_NZ ? j : HMPC_LZ + j - HMPC_NZ;
+      change[j] = R(0.0);
+      for (int i = 0; i < HMPC_NZ; ++i)
+        change[j] += pull[i] * (aside->slope[i][column] - at->slope[i][column]) * target_scale[j] / target_heed[i];
+      for (int i = 0; i < HMPC_NY; ++i)
+        if (q_y[i] > R(0.0))
+          change[j] += target_root[i] * target_root[i] * (at->y[i] - goal[i]) *
+                       (slope_of_output(aside, i, j) - slope_of_output(at, i, j));
+      change[j] /= HMPC_TARGET_ASIDE;
+    }
+    for (int l = 0; l < m; ++l) {
+      if (k < m) work->bend[k][l] = hmpc_dot(work->along[l], change, NT);
+      if (k == m) turned[l] = far * hmpc_dot(work->along[l], change, NT);
+    }
+  }
+  for (int k = 0; k < m; ++k)
+    for (int l = 0; l <= k; ++l) {
+      const real mean = R(0.5) * (work->bend[k][l] + work->bend[l][k]);
+      work->bend[k][l] = work->bend[l][k] = mean;
+      norm += (k == l ? R(1.0) : R(2.0)) * mean * mean;
+    }
+  return hmpc_sqrt(norm);
+}
+
+/* Whether the first m rows of work->h are positive definite. */
+static int definite(hmpc_search *work, int m) {
+  for (int i = 0; i < m; ++i)
+    for (int j = 0; j <= i; ++j) {
+      const real rest = work->h[i][j] - hmpc_dot(work->gram[i], work->gram[j], j);
+      if (i == j && !(rest > R(0.0))) return 0;
+      work->gram[i][j] = i == j ? hmpc_sqrt(rest) : rest / work->gram[j][j];
+    }
+  return 1;
+}
+
+/* Gauss-Newton step at work->at; 0 if its QP has no solution. curved: with second derivatives along the steady states,
+   which matter if a set-point beyond reach is closest where an output turns. */
+static int newton(hmpc_state *s, const real *goal, const real *w, int bounded, int curved, real *step) {
+  hmpc_search *const work = &s->search;
+  const hmpc_point *const at = &work->at;
+  const real *const u = at->v + HMPC_NZ;
+  real push[HMPC_NY] = {R(0.0)}, pull[HMPC_NZ], turned[NT] = {R(0.0)}, norm = R(0.0);
+  real onto[NT], sees[HMPC_NY][NT] = {{R(0.0)}}, error[HMPC_NY], g[NT], row[NT], eta[NT];
+  real trace = R(0.0), size = R(1e-30);
+  int order[HMPC_NZ], tracked = 0, count = 0;
+  if (curved) {
+    for (int i = 0; i < HMPC_NY; ++i)
+      if (q_y[i] > R(0.0)) push[i] = target_root[i] * target_root[i] * (at->y[i] - goal[i]);
+    multipliers(work, push, pull);
+  }
+  slopes_of_rest(work);
+  for (int i = 0; i < HMPC_NZ; ++i) {
     if (!hmpc_all_finite(work->a[i], NT) || !hmpc_finite(at->rest[i])) return 0;
     row[i] = -at->rest[i] / target_heed[i];
   }
@@ -362,9 +464,7 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   }
   for (int i = 0; i < HMPC_NY; ++i) {
     if (!(q_y[i] > R(0.0))) continue;
-    for (int j = 0; j < NT; ++j) row[j] = R(0.0);
-    for (int j = 0; j < HMPC_NX; ++j) row[j] = OUTPUT_X(at)[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) row[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
+    for (int j = 0; j < NT; ++j) row[j] = slope_of_output(at, i, j);
     for (int k = 0; k < m; ++k) sees[tracked][k] = target_root[i] * hmpc_dot(row, work->along[k], NT);
     error[tracked] = target_root[i] * (goal[i] - at->y[i] - hmpc_dot(row, onto, NT));
     ++tracked;
@@ -378,12 +478,29 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
       work->answer += sees[i][k] * hmpc_dot(target_slopes[i], work->along[k] + HMPC_NZ, HMPC_NU);
   memset(work->h, 0, sizeof work->h);
   memset(g, 0, sizeof g);
+  if (curved) norm = bend(s, goal, w, pull, m, onto, turned);
+  const real whole = curved ? hmpc_sqrt(size * size + norm) : size, factor = R(1.0) / whole / whole;
   for (int i = 0; i < tracked; ++i) {
-    const real factor = R(1.0) / size / size;
     for (int k = 0; k < m; ++k) {
       g[k] -= sees[i][k] * error[i] * factor;
       hmpc_add(work->h[k], sees[i][k] * factor, sees[i], m);
     }
+  }
+  if (curved) {
+    for (int k = 0; k < m; ++k) {
+      g[k] += turned[k] * factor;
+      hmpc_add(work->h[k], factor, work->bend[k], m);
+    }
+    const int convex = definite(work, m);
+    for (int j = 0; j < NT && !convex; ++j) { /* against leaving bounds */
+      if (!at_bound(at, j)) continue;
+      for (int k = 0; k < m; ++k) row[k] = work->along[k][j];
+      const real length = hmpc_dot(row, row, m);
+      for (int k = 0; k < m && length > R(0.0); ++k)
+        hmpc_add(work->h[k], HMPC_TARGET_STIFF * norm * factor * row[k] / length, row, m);
+    }
+    const int enough = convex || definite(work, m);
+    for (int k = 0; k < m && !enough; ++k) work->h[k][k] += R(2.0) * norm * factor;
   }
   for (int j = 0; j < HMPC_NU; ++j) { /* directions that the outputs do not determine: towards u_rest */
     const real far = (u_rest[j] - u[j]) / target_scale[HMPC_NZ + j] - onto[HMPC_NZ + j];
@@ -414,9 +531,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
     if (!bounds(work, m, row, at->v[j] / scale + onto[j], range[0] / scale, range[1] / scale, &count)) return 0;
   }
   for (int i = 0; i < HMPC_NY && bounded; ++i) {
-    real slope[NT] = {R(0.0)};
-    for (int j = 0; j < HMPC_NX; ++j) slope[j] = OUTPUT_X(at)[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) slope[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
+    real slope[NT];
+    for (int j = 0; j < NT; ++j) slope[j] = slope_of_output(at, i, j);
     for (int k = 0; k < m; ++k) row[k] = hmpc_dot(slope, work->along[k], NT);
     const real now = at->y[i] + hmpc_dot(slope, onto, NT);
     if (!bounds(work, m, row, now, target_y_range[i][0], target_y_range[i][1], &count)) return 0;
@@ -434,26 +550,28 @@ static void place(const hmpc_steady *from, real *v) {
   memcpy(v + HMPC_NZ, from->u, sizeof from->u);
 }
 
-/* Gauss-Newton method from v; bounded: within the bounds of states and outputs. */
-static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_descent *found) {
+/* Gauss-Newton method from v; bounded: within the bounds of states and outputs; firm: ends as soon as its end is not
+   sure. Second derivatives are used once a whole step fails. */
+static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, int firm,
+                    hmpc_descent *found) {
   hmpc_search *const work = &s->search;
   hmpc_point *const at = &work->at, *const after = &work->after;
   real step[NT], there[NT], before = HMPC_HUGE, off = R(0.0), apart = R(0.0);
   real lacks[HMPC_TARGET_ITERATIONS + 1], offs[HMPC_TARGET_ITERATIONS + 1];
   real weight = HMPC_TARGET_LEAST_WEIGHT;
-  int done = 0, sure = 1;
+  int done = 0, sure = 1, curved = 0, n = 0;
   look(s, v, goal, w, at);
   lacks[0] = at->lacks;
   offs[0] = at->off;
   for (int k = 1; k <= HMPC_TARGET_ITERATIONS; ++k) {
     real size = R(0.0), share = R(1.0), from;
-    if (!newton(work, goal, bounded, step)) break;
+    if ((firm && !sure) || !newton(s, goal, w, bounded, curved, step)) break;
     for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs(step[i] / target_scale[i]));
     if (size <= HMPC_TARGET_STEADY) {
       done = at->lacks <= HMPC_TARGET_STILL;
       break;
     }
-    if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * before)) sure = 0;
+    const real last = before;
     before = size;
     /* exact penalty: the step must reduce the merit to first order */
     if (at->lacks > HMPC_TARGET_STILL)
@@ -467,7 +585,7 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       real second[NT], again = R(0.0);
       work->kept = *at;
       *at = *after;
-      if (newton(work, goal, bounded, second)) {
+      if (newton(s, goal, w, bounded, curved, second)) {
         for (int i = 0; i < NT; ++i) again = hmpc_max(again, hmpc_abs(second[i] / target_scale[i]));
         for (int i = 0; i < NT; ++i) there[i] = at->v[i] + second[i];
         settle(s, there, goal, w, after);
@@ -479,26 +597,35 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       *at = work->kept;
       work->answer = answer;
     }
-    for (int half = 0; half < HALVINGS && !(merit(after, weight) < from); ++half) {
+    if (!(merit(after, weight) < from) && !(size < HMPC_TARGET_NEAR) && at->off > HMPC_TARGET_REACHED && !curved) {
+      curved = 1; /* the same point again */
+      before = last;
+      continue;
+    }
+    if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * last)) sure = 0;
+    /* where an output turns, the merit is flat, and rounding hides what the last steps gain */
+    const int flat = curved && size < HMPC_TARGET_NEAR && size <= HMPC_TARGET_CONTRACTS * last;
+    for (int half = 0; half < HALVINGS && !flat && !(merit(after, weight) < from); ++half) {
       share *= R(0.5);
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
       if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
-    if (!(merit(after, weight) < from)) { /* only rounding errors remain, or there is no progress */
-      done = size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
+    if (!flat && !(merit(after, weight) < from)) { /* no progress, or only that towards the operating point */
+      done = at->lacks <= HMPC_TARGET_STILL && (size < HMPC_TARGET_NEAR || at->off <= HMPC_TARGET_REACHED);
+      if (!(size < HMPC_TARGET_NEAR)) sure = 0;
       break;
     }
     *at = *after;
-    lacks[k] = at->lacks;
-    offs[k] = at->off;
+    lacks[++n] = at->lacks;
+    offs[n] = at->off;
     size = R(0.0);
     for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs((at->v[i] - v[i]) / target_scale[i]));
     if (size > HMPC_TARGET_AWAY) break;
-    if (k < HMPC_TARGET_WITHIN) continue;
-    if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[k - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL) &&
+    if (n < HMPC_TARGET_WITHIN) continue;
+    if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[n - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL) &&
         merit(at, weight) >
-            HMPC_TARGET_CREEPS * (weight * lacks[k - HMPC_TARGET_WITHIN] + offs[k - HMPC_TARGET_WITHIN]))
+            HMPC_TARGET_CREEPS * (weight * lacks[n - HMPC_TARGET_WITHIN] + offs[n - HMPC_TARGET_WITHIN]))
       break;
   }
   for (int i = 0; i < HMPC_NY; ++i)
@@ -544,7 +671,7 @@ static int follow(hmpc_state *s, const real *v, const real *y, const real *w, in
     for (int j = 0; j < HMPC_ND && !v; ++j) work->d[j] = to * s->d[j];
     for (int j = 0; j < HMPC_NW && !v; ++j) work->w[j] = w_rest[j] + to * (w[j] - w_rest[j]);
     for (int i = 0; i < HMPC_NY; ++i) towards[i] = begun[i] + to * (y[i] - begun[i]);
-    descend(s, at, towards, work->w, 1, found);
+    descend(s, at, towards, work->w, 1, sure, found);
     if (found->at.steady && (found->sure || !sure)) {
       arrived = to >= R(1.0);
       memcpy(at, found->v, sizeof at);
@@ -575,53 +702,69 @@ static int best(const hmpc_search *work, int n) {
   return chosen;
 }
 
-/* Steady state for outputs y; weighted outputs are finite. The search has the order of Targets.at in Python. If no
-   steady state keeps the bounds of states and outputs, it is searched without them. */
-void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
-                       hmpc_steady *found) {
+/* The search of hmpc_steady_state; recent: start is the result of a search for the same set-point, and not long ago it
+   was searched from several starts. Returns whether it was now. */
+static int search(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
+                  int recent, hmpc_steady *found) {
   hmpc_search *const work = &s->search;
   hmpc_descent trial;
   const int known = start && start->steady ? 1 : 0;
   real first[NT];
   int n = 0;
+  wide = wide && (known || !recent);
   memcpy(work->d, s->d, sizeof(real) * HMPC_ND);
   memcpy(first, target_starts[0], sizeof first);
   if (known) place(start, first);
   if (known || !wide) {
-    descend(s, first, y, w, 1, &work->tried[0]);
+    descend(s, first, y, w, 1, 0, &work->tried[0]);
     n = 1;
     if (work->tried[0].lost && known) {
-      descend(s, target_starts[0], y, w, 1, &trial);
+      descend(s, target_starts[0], y, w, 1, 0, &trial);
       if (trial.at.steady && trial.off < work->tried[0].off) work->tried[0] = trial;
     }
     *found = work->tried[0].at;
-    if (work->tried[0].sure || (found->steady && !wide)) return;
+    if (work->tried[0].sure || (found->steady && (recent || !wide))) return 0;
   }
   if (wide) {
     for (int own = 0; own <= known; ++own) {
       if (!follow(s, own ? first : NULL, y, w, 1, &work->tried[n])) continue;
       if (!work->tried[n].lost) {
         *found = work->tried[n].at;
-        return;
+        return wide;
       }
       ++n;
     }
-    for (int k = 0; k < HMPC_TARGET_STARTS; ++k) descend(s, target_starts[k], y, w, 1, &work->tried[n++]);
+    for (int k = 0; k < HMPC_TARGET_STARTS; ++k) descend(s, target_starts[k], y, w, 1, 0, &work->tried[n++]);
     const int chosen = best(work, n);
     if (chosen >= 0 || follow(s, known ? first : NULL, y, w, 0, &trial)) {
       *found = chosen >= 0 ? work->tried[chosen].at : trial.at;
-      return;
+      return wide;
     }
   }
   *found = work->tried[0].at;
   for (int k = 0; k <= (wide && known); ++k) {
-    descend(s, k ? target_starts[0] : first, y, w, 0, &trial);
+    descend(s, k ? target_starts[0] : first, y, w, 0, 0, &trial);
     if (trial.at.steady) {
       *found = trial.at;
-      return;
+      return wide;
     }
   }
+  return wide;
 }
+
+/* Steady state for outputs y; weighted outputs are finite. The search has the order of Targets.at in Python. If no
+   steady state keeps the bounds of states and outputs, it is searched without them. */
+void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
+                       hmpc_steady *found) {
+  int again = start != NULL, age = HMPC_TARGET_WAIT;
+  for (int i = 0; i < HMPC_NY && again; ++i)
+    if (q_y[i] > R(0.0)) again = y[i] <= start->goal[i] && y[i] >= start->goal[i];
+  if (again && start->age + 1 < age) age = start->age + 1;
+  if (search(s, y, w, start, wide, age < HMPC_TARGET_WAIT, found)) age = 0;
+  memcpy(found->goal, y, sizeof found->goal);
+  found->age = age;
+}
+
 
 static void set_target(hmpc_target *to, int k, const real *x, const real *u, const real *y) {
   memcpy(to->x[k], x, sizeof to->x[k]);
