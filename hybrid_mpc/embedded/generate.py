@@ -51,7 +51,8 @@ FIRST = 25
 SEARCH: Mapping[str, tuple[str, str]] = {
     "STEADY": (repr(equilibrium.STEADY), "1e-5"), "STILL": (repr(equilibrium.STILL), "1e-4"),
     "NEAR": (repr(equilibrium.NEAR), "1e-3"), "REACHED": (repr(equilibrium.REACHED), "1e-3"),
-    "RANK": (repr(equilibrium.RANK), "1e-5"), "ASIDE": (repr(equilibrium.ASIDE), "1e-2"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
+    "RANK": (repr(equilibrium.RANK), "1e-5"),
+    "ASIDE": (repr(equilibrium.ASIDE), "1e-2"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
     **{name: (repr(getattr(equilibrium, name)),) * 2 for name in (
         "STALLED", "CREEPS", "CONTRACTS", "FOLLOWED", "LEAST_PART", "LEAST_WEIGHT", "EQUAL", "STIFF",
     )}, "VIOLATED": ("1e-12", "1e-6"),

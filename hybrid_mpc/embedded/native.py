@@ -218,7 +218,8 @@ class State:
         shapes: dict[str, tuple[int, ...]] = {
             "x": (n["NX"],), "h": (n["NH"],), "d": (n["ND"],), "w": (n_w,), "plan_u": (n["N"], n["NU"]),
             "plan_z": (n["N"] + 1, -(-n_z // 8) * 8), "plan_w": (n["N"], max(1, n_w)), "u": (n["NU"],),
-            "steady_x": (n["NX"],), "steady_h": (n["NH"],), "steady_u": (n["NU"],), "steady_y": (n["NY"],), "steady_goal": (n["NY"],),
+            "steady_x": (n["NX"],), "steady_h": (n["NH"],), "steady_u": (n["NU"],), "steady_y": (n["NY"],),
+            "steady_goal": (n["NY"],),
             "given_way": (max(1, n["SOFT_X"] + n["SOFT_E"]),),
         }  # fmt: skip
         size, *places = library.places

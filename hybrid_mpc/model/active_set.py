@@ -62,7 +62,9 @@ class RowQP:
 
         A row that hardly depends on the unknowns needs a smaller one: its violation over its norm is the distance.
         """
-        within = min(max(1.0, float(np.abs(multipliers).max(initial=0.0)) / LARGE) * PRIMAL_TOLERANCE, LOOSEST)
+        within = min(
+            max(1.0, float(np.abs(multipliers).max(initial=0.0)) / LARGE) * PRIMAL_TOLERANCE, LOOSEST
+        )
         return within * self._shares + self._rounding
 
     @cached_property

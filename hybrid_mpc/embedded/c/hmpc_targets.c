@@ -23,7 +23,11 @@ enum {
   NT = HMPC_NT,
   HALVINGS = 10, /* of a step that does not reduce the merit */
   SWEEPS = 30,   /* of Jacobi rotations */
-  ROUNDS = 10 * HMPC_TARGET_ROWS
+  ROUNDS = 10 * HMPC_TARGET_ROWS,
+  ROWS = HMPC_NZ + HMPC_NY,
+  PLAIN = 0, /* second derivatives in a step: none, */
+  CURVED,    /* of the deviation: where a set-point beyond reach is closest, an output may turn, */
+  LEANING    /* of the distance from the operating point, at the set-point */
 };
 
 /* Residual, outputs and derivatives at v. */
@@ -134,14 +138,14 @@ static void settle(hmpc_state *s, const real *v, const real *goal, const real *w
 
 /* Householder factors of work->a with row exchanges, the largest row first: a = (l, 0) q'. l has as many columns as the
    rank and is stored in work->a before each row's reflector; order: original number of each row. */
-static int factorize(hmpc_search *work, int *order) {
+static int factorize(hmpc_search *work, int rows, int *order) {
   real first = R(0.0);
   int rank = 0;
-  for (int i = 0; i < HMPC_NZ; ++i) order[i] = i;
-  for (int k = 0; k < HMPC_NZ; ++k, ++rank) {
+  for (int i = 0; i < rows; ++i) order[i] = i;
+  for (int k = 0; k < rows && k < NT; ++k, ++rank) {
     int best = k;
     real largest = R(-1.0);
-    for (int i = k; i < HMPC_NZ; ++i) {
+    for (int i = k; i < rows; ++i) {
       const real size = hmpc_dot(work->a[i] + k, work->a[i] + k, NT - k);
       if (size > largest) {
         largest = size;
@@ -165,7 +169,7 @@ static int factorize(hmpc_search *work, int *order) {
     v[k] -= diagonal; /* the reflector 1 - v v' / half, with |v[k]| of at least size */
     work->half[k] = R(0.5) * hmpc_dot(v + k, v + k, NT - k);
     work->diagonal[k] = diagonal;
-    for (int i = k + 1; i < HMPC_NZ; ++i)
+    for (int i = k + 1; i < rows; ++i)
       hmpc_add(work->a[i] + k, -hmpc_dot(v + k, work->a[i] + k, NT - k) / work->half[k], v + k, NT - k);
   }
   return rank;
@@ -365,21 +369,29 @@ static int at_bound(const hmpc_point *p, int j) {
   return !(p->v[j] - low > near && high - p->v[j] > near);
 }
 
-/* Multipliers of the steady-state equations at work->at, in which the slope of the outputs' deviation vanishes. */
-static void multipliers(hmpc_search *work, const real *push, real *to) {
+/* Multipliers at work->at: of the equations and, if leaning, of the weighted outputs, so that the slope of the distance
+   from the operating point vanishes; else of the equations, so that the slope of the outputs' deviation vanishes. */
+static void multipliers(hmpc_search *work, const real *goal, int leaning, real *to) {
   const hmpc_point *const at = &work->at;
   real b[NT] = {R(0.0)};
-  int order[HMPC_NZ];
+  int order[ROWS], rows = HMPC_NZ;
   slopes_of_rest(work);
+  memset(to, 0, sizeof(real) * ROWS);
+  for (int i = 0; i < HMPC_NY; ++i)
+    if (q_y[i] > R(0.0)) {
+      to[rows] = leaning ? R(0.0) : target_root[i] * (at->y[i] - goal[i]);
+      for (int j = 0; j < NT; ++j) work->a[rows][j] = target_root[i] * slope_of_output(at, i, j);
+      ++rows;
+    }
   for (int j = 0; j < NT; ++j) {
     const int held = at_bound(at, j);
-    for (int i = 0; i < HMPC_NZ && held; ++i) work->a[i][j] = R(0.0);
-    for (int i = 0; i < HMPC_NY && !held; ++i) b[j] -= push[i] * slope_of_output(at, i, j);
+    for (int i = 0; i < rows && held; ++i) work->a[i][j] = R(0.0);
+    for (int i = HMPC_NZ; i < rows; ++i) b[j] -= to[i] * work->a[i][j];
+    if (leaning && !held && j >= HMPC_NZ) b[j] = (u_rest[j - HMPC_NZ] - at->v[j]) / target_scale[j];
   }
-  const int rank = factorize(work, order);
+  const int rank = factorize(work, leaning ? rows : HMPC_NZ, order);
   for (int k = 0; k < rank; ++k)
     hmpc_add(b + k, -hmpc_dot(work->a[k] + k, b + k, NT - k) / work->half[k], work->a[k] + k, NT - k);
-  memset(to, 0, sizeof(real) * HMPC_NZ);
   for (int i = rank - 1; i >= 0; --i) {
     real value = b[i];
     for (int j = i + 1; j < rank; ++j) value -= work->a[j][i] * to[order[j]];
@@ -387,13 +399,13 @@ static void multipliers(hmpc_search *work, const real *push, real *to) {
   }
 }
 
-/* Second derivatives of the Lagrangian along the m directions work->along, in work->bend, and their product with the
-   step onto the steady states, by differences of Jacobians. Returns the norm of the second derivatives. */
-static real bend(hmpc_state *s, const real *goal, const real *w, const real *pull, int m, const real *onto, real *turned) {
+/* Second derivatives of the Lagrangian with the multipliers pull along the m directions work->along, in work->bend, and
+   their product with the step onto the steady states, by differences of Jacobians. */
+static void bend(hmpc_state *s, const real *goal, const real *w, const real *pull, int m, const real *onto,
+                 real *turned) {
   hmpc_search *const work = &s->search;
   const hmpc_point *const at = &work->at, *const aside = &work->settled;
   const real far = hmpc_sqrt(hmpc_dot(onto, onto, NT)) + R(1e-30);
-  real norm = R(0.0);
   for (int k = 0; k <= m; ++k) {
     real v[NT], change[NT];
     for (int j = 0; j < NT; ++j)
@@ -401,13 +413,13 @@ static real bend(hmpc_state *s, const real *goal, const real *w, const real *pul
     look(s, v, goal, w, &work->settled);
     for (int j = 0; j < NT; ++j) {
       const int column = j < HMPC_NZ ? j : HMPC_LZ + j - HMPC_NZ;
+      int row = HMPC_NZ;
       change[j] = R(0.0);
       for (int i = 0; i < HMPC_NZ; ++i)
         change[j] += pull[i] * (aside->slope[i][column] - at->slope[i][column]) * target_scale[j] / target_heed[i];
       for (int i = 0; i < HMPC_NY; ++i)
         if (q_y[i] > R(0.0))
-          change[j] += target_root[i] * target_root[i] * (at->y[i] - goal[i]) *
-                       (slope_of_output(aside, i, j) - slope_of_output(at, i, j));
+          change[j] += pull[row++] * target_root[i] * (slope_of_output(aside, i, j) - slope_of_output(at, i, j));
       change[j] /= HMPC_TARGET_ASIDE;
     }
     for (int l = 0; l < m; ++l) {
@@ -416,12 +428,14 @@ static real bend(hmpc_state *s, const real *goal, const real *w, const real *pul
     }
   }
   for (int k = 0; k < m; ++k)
-    for (int l = 0; l <= k; ++l) {
-      const real mean = R(0.5) * (work->bend[k][l] + work->bend[l][k]);
-      work->bend[k][l] = work->bend[l][k] = mean;
-      norm += (k == l ? R(1.0) : R(2.0)) * mean * mean;
-    }
-  return hmpc_sqrt(norm);
+    for (int l = 0; l < k; ++l) work->bend[k][l] = work->bend[l][k] = R(0.5) * (work->bend[k][l] + work->bend[l][k]);
+}
+
+/* Norm of the first m rows of work->bend. */
+static real bend_norm(const hmpc_search *work, int m) {
+  real sum = R(0.0);
+  for (int k = 0; k < m; ++k) sum += hmpc_dot(work->bend[k], work->bend[k], m);
+  return hmpc_sqrt(sum);
 }
 
 /* Whether the first m rows of work->h are positive definite. */
@@ -435,27 +449,49 @@ static int definite(hmpc_search *work, int m) {
   return 1;
 }
 
-/* Gauss-Newton step at work->at; 0 if its QP has no solution. curved: with second derivatives along the steady states,
-   which matter if a set-point beyond reach is closest where an output turns. */
-static int newton(hmpc_state *s, const real *goal, const real *w, int bounded, int curved, real *step) {
+/* Adds factor times work->bend to work->h, and more until that is positive definite: first against leaving bounds. */
+static void add_bend(hmpc_search *work, int m, real factor) {
+  const real norm = factor * bend_norm(work, m);
+  real row[NT];
+  for (int k = 0; k < m; ++k) hmpc_add(work->h[k], factor, work->bend[k], m);
+  const int convex = definite(work, m);
+  for (int j = 0; j < NT && !convex; ++j) {
+    if (!at_bound(&work->at, j)) continue;
+    for (int k = 0; k < m; ++k) row[k] = work->along[k][j];
+    const real length = hmpc_dot(row, row, m);
+    for (int k = 0; k < m && length > R(0.0); ++k)
+      hmpc_add(work->h[k], HMPC_TARGET_STIFF * norm * row[k] / length, row, m);
+  }
+  const int enough = convex || definite(work, m);
+  for (int k = 0; k < m && !enough; ++k) work->h[k][k] += R(2.0) * norm;
+}
+
+/* Removes the directions that the outputs determine from a row. */
+static void unseen(const hmpc_search *work, int m, int tracked, real size, real *row) {
+  for (int i = 0; i < tracked; ++i) { /* orthogonal */
+    const real *const seen = work->turned[i];
+    const real length = hmpc_dot(seen, seen, m);
+    if (hmpc_sqrt(length) > HMPC_TARGET_RANK * size) hmpc_add(row, -hmpc_dot(row, seen, m) / length, seen, m);
+  }
+}
+
+/* Gauss-Newton step at work->at; 0 if its QP has no solution. mode: which second derivatives along the steady states it
+   has. */
+static int newton(hmpc_state *s, const real *goal, const real *w, int bounded, int mode, real *step) {
   hmpc_search *const work = &s->search;
   const hmpc_point *const at = &work->at;
   const real *const u = at->v + HMPC_NZ;
-  real push[HMPC_NY] = {R(0.0)}, pull[HMPC_NZ], turned[NT] = {R(0.0)}, norm = R(0.0);
+  real pull[ROWS], turned[NT] = {R(0.0)};
   real onto[NT], sees[HMPC_NY][NT] = {{R(0.0)}}, error[HMPC_NY], g[NT], row[NT], eta[NT];
   real trace = R(0.0), size = R(1e-30);
   int order[HMPC_NZ], tracked = 0, count = 0;
-  if (curved) {
-    for (int i = 0; i < HMPC_NY; ++i)
-      if (q_y[i] > R(0.0)) push[i] = target_root[i] * target_root[i] * (at->y[i] - goal[i]);
-    multipliers(work, push, pull);
-  }
+  if (mode != PLAIN) multipliers(work, goal, mode == LEANING, pull);
   slopes_of_rest(work);
   for (int i = 0; i < HMPC_NZ; ++i) {
     if (!hmpc_all_finite(work->a[i], NT) || !hmpc_finite(at->rest[i])) return 0;
     row[i] = -at->rest[i] / target_heed[i];
   }
-  const int rank = factorize(work, order), m = NT - rank;
+  const int rank = factorize(work, HMPC_NZ, order), m = NT - rank;
   shortest(work, rank, order, row, onto); /* step onto the steady states */
   for (int k = 0; k < m; ++k) {           /* directions along them */
     memset(work->along[k], 0, sizeof work->along[k]);
@@ -478,43 +514,41 @@ static int newton(hmpc_state *s, const real *goal, const real *w, int bounded, i
       work->answer += sees[i][k] * hmpc_dot(target_slopes[i], work->along[k] + HMPC_NZ, HMPC_NU);
   memset(work->h, 0, sizeof work->h);
   memset(g, 0, sizeof g);
-  if (curved) norm = bend(s, goal, w, pull, m, onto, turned);
-  const real whole = curved ? hmpc_sqrt(size * size + norm) : size, factor = R(1.0) / whole / whole;
+  if (mode != PLAIN) bend(s, goal, w, pull, m, onto, turned);
+  const real whole = mode == CURVED ? hmpc_sqrt(size * size + bend_norm(work, m)) : size;
+  const real factor = R(1.0) / whole / whole;
   for (int i = 0; i < tracked; ++i) {
     for (int k = 0; k < m; ++k) {
       g[k] -= sees[i][k] * error[i] * factor;
       hmpc_add(work->h[k], sees[i][k] * factor, sees[i], m);
     }
   }
-  if (curved) {
-    for (int k = 0; k < m; ++k) {
-      g[k] += turned[k] * factor;
-      hmpc_add(work->h[k], factor, work->bend[k], m);
-    }
-    const int convex = definite(work, m);
-    for (int j = 0; j < NT && !convex; ++j) { /* against leaving bounds */
-      if (!at_bound(at, j)) continue;
-      for (int k = 0; k < m; ++k) row[k] = work->along[k][j];
-      const real length = hmpc_dot(row, row, m);
-      for (int k = 0; k < m && length > R(0.0); ++k)
-        hmpc_add(work->h[k], HMPC_TARGET_STIFF * norm * factor * row[k] / length, row, m);
-    }
-    const int enough = convex || definite(work, m);
-    for (int k = 0; k < m && !enough; ++k) work->h[k][k] += R(2.0) * norm * factor;
+  if (mode == CURVED) {
+    for (int k = 0; k < m; ++k) g[k] += turned[k] * factor;
+    add_bend(work, m, factor);
   }
   for (int j = 0; j < HMPC_NU; ++j) { /* directions that the outputs do not determine: towards u_rest */
     const real far = (u_rest[j] - u[j]) / target_scale[HMPC_NZ + j] - onto[HMPC_NZ + j];
     for (int k = 0; k < m; ++k) row[k] = work->along[k][HMPC_NZ + j];
-    memcpy(eta, row, sizeof eta);
-    for (int i = 0; i < tracked; ++i) {
-      const real *const seen = work->turned[i];
-      const real length = hmpc_dot(seen, seen, m);
-      if (hmpc_sqrt(length) > HMPC_TARGET_RANK * size) hmpc_add(row, -hmpc_dot(eta, seen, m) / length, seen, m);
-    }
+    unseen(work, m, tracked, size, row);
     for (int k = 0; k < m; ++k) {
       g[k] -= HMPC_TARGET_FREE * row[k] * far;
       hmpc_add(work->h[k], HMPC_TARGET_FREE * row[k], row, m);
     }
+  }
+  if (mode == LEANING) {
+    for (int side = 0; side < 2; ++side) /* both sides of a symmetric matrix */
+      for (int k = 0; k < m; ++k) {
+        unseen(work, m, tracked, size, work->bend[k]);
+        for (int l = 0; l < k; ++l) {
+          const real kept = work->bend[k][l];
+          work->bend[k][l] = work->bend[l][k];
+          work->bend[l][k] = kept;
+        }
+      }
+    unseen(work, m, tracked, size, turned);
+    for (int k = 0; k < m; ++k) g[k] += HMPC_TARGET_FREE * turned[k];
+    add_bend(work, m, HMPC_TARGET_FREE);
   }
   for (int k = 0; k < m; ++k) trace += work->h[k][k];
   for (int k = 0; k < m; ++k) work->h[k][k] += HMPC_TARGET_DAMPING * trace + R(0.01) * HMPC_TARGET_DAMPING;
@@ -551,7 +585,8 @@ static void place(const hmpc_steady *from, real *v) {
 }
 
 /* Gauss-Newton method from v; bounded: within the bounds of states and outputs; firm: ends as soon as its end is not
-   sure. Second derivatives are used once a whole step fails. */
+   sure. Second derivatives of the deviation are used once a whole step fails, those of the distance from the operating
+   point once steps at the set-point do not contract. */
 static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, int firm,
                     hmpc_descent *found) {
   hmpc_search *const work = &s->search;
@@ -559,17 +594,35 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
   real step[NT], there[NT], before = HMPC_HUGE, off = R(0.0), apart = R(0.0);
   real lacks[HMPC_TARGET_ITERATIONS + 1], offs[HMPC_TARGET_ITERATIONS + 1];
   real weight = HMPC_TARGET_LEAST_WEIGHT;
-  int done = 0, sure = 1, curved = 0, n = 0;
+  int done = 0, sure = 1, mode = PLAIN, near = 0, tracked = 0, n = 0;
+  for (int i = 0; i < HMPC_NY; ++i) tracked += q_y[i] > R(0.0);
   look(s, v, goal, w, at);
   lacks[0] = at->lacks;
   offs[0] = at->off;
   for (int k = 1; k <= HMPC_TARGET_ITERATIONS; ++k) {
     real size = R(0.0), share = R(1.0), from;
-    if ((firm && !sure) || !newton(s, goal, w, bounded, curved, step)) break;
+    if ((firm && !sure) || !newton(s, goal, w, bounded, mode, step)) break;
     for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs(step[i] / target_scale[i]));
     if (size <= HMPC_TARGET_STEADY) {
       done = at->lacks <= HMPC_TARGET_STILL;
       break;
+    }
+    const int spare = HMPC_NU > tracked && mode != LEANING && at->lacks <= HMPC_TARGET_STILL &&
+                      at->off <= HMPC_TARGET_REACHED; /* inputs that set-points do not determine */
+    if (spare && size > HMPC_TARGET_CONTRACTS * before) {
+      mode = LEANING; /* the same point again */
+      near = size < HMPC_TARGET_NEAR;
+      work->good = *at;
+      before = HMPC_HUGE;
+      continue;
+    }
+    if (mode == LEANING) {
+      if (!(size <= HMPC_TARGET_CONTRACTS * before)) break;
+      before = size;
+      for (int i = 0; i < NT; ++i) there[i] = at->v[i] + step[i];
+      settle(s, there, goal, w, after);
+      *at = *after;
+      continue;
     }
     const real last = before;
     before = size;
@@ -585,7 +638,7 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       real second[NT], again = R(0.0);
       work->kept = *at;
       *at = *after;
-      if (newton(s, goal, w, bounded, curved, second)) {
+      if (newton(s, goal, w, bounded, mode, second)) {
         for (int i = 0; i < NT; ++i) again = hmpc_max(again, hmpc_abs(second[i] / target_scale[i]));
         for (int i = 0; i < NT; ++i) there[i] = at->v[i] + second[i];
         settle(s, there, goal, w, after);
@@ -597,24 +650,28 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       *at = work->kept;
       work->answer = answer;
     }
-    if (!(merit(after, weight) < from) && !(size < HMPC_TARGET_NEAR) && at->off > HMPC_TARGET_REACHED && !curved) {
-      curved = 1; /* the same point again */
+    if (!(merit(after, weight) < from) && !(size < HMPC_TARGET_NEAR) && at->off > HMPC_TARGET_REACHED && mode == PLAIN) {
+      mode = CURVED; /* the same point again */
       before = last;
       continue;
     }
     if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * last)) sure = 0;
     /* where an output turns, the merit is flat, and rounding hides what the last steps gain */
-    const int flat = curved && size < HMPC_TARGET_NEAR && size <= HMPC_TARGET_CONTRACTS * last;
+    const int flat = mode == CURVED && size < HMPC_TARGET_NEAR && size <= HMPC_TARGET_CONTRACTS * last;
     for (int half = 0; half < HALVINGS && !flat && !(merit(after, weight) < from); ++half) {
       share *= R(0.5);
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
       if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
-    if (!flat && !(merit(after, weight) < from)) { /* no progress, or only that towards the operating point */
-      done = at->lacks <= HMPC_TARGET_STILL && (size < HMPC_TARGET_NEAR || at->off <= HMPC_TARGET_REACHED);
-      if (!(size < HMPC_TARGET_NEAR)) sure = 0;
-      break;
+    if (!flat && !(merit(after, weight) < from)) { /* only rounding errors remain, or there is no progress */
+      done = !spare && size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
+      if (!spare) break;
+      mode = LEANING;
+      near = size < HMPC_TARGET_NEAR;
+      work->good = *at;
+      before = HMPC_HUGE;
+      continue;
     }
     *at = *after;
     lacks[++n] = at->lacks;
@@ -627,6 +684,11 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
         merit(at, weight) >
             HMPC_TARGET_CREEPS * (weight * lacks[n - HMPC_TARGET_WITHIN] + offs[n - HMPC_TARGET_WITHIN]))
       break;
+  }
+  if (mode == LEANING && !done) { /* the set-point is reached, farther from the operating point */
+    *at = work->good;
+    done = 1;
+    sure = sure && near;
   }
   for (int i = 0; i < HMPC_NY; ++i)
     if (q_y[i] > R(0.0)) off = hmpc_max(off, target_root[i] * hmpc_abs(at->y[i] - goal[i]));
