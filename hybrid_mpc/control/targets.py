@@ -11,6 +11,8 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.equilibrium import (
+    CURVED,
+    PLAIN,
     REACHED,
     WAIT,
     Descent,
@@ -142,7 +144,11 @@ class Targets:
         first = self.beside[0] if given is None else given
         tried: list[Descent] = []
         if given is not None or not wide:
-            found = search.descend(first, goal)
+            # an input within its limits beyond reach of the set-point: there an output turns
+            limits = self._ocp.u_min, self._ocp.u_max
+            turns = start is not None and start.steady and not start.reached
+            turns = turns and bool(np.any((start.u > limits[0]) & (start.u < limits[1])))
+            found = search.descend(first, goal, mode=CURVED if turns else PLAIN)
             if self._lost(found) and given is not None:
                 other = search.descend(self.beside[0], goal)
                 found = other if other.steady and other.off < found.off else found

@@ -311,14 +311,17 @@ class SteadySearch:
         self._seen = np.flatnonzero(np.isfinite(bounds.y_lower) | np.isfinite(bounds.y_upper))
 
     @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
-    def descend(self, v: Array, goal: Array, bounded: bool = True, firm: bool = False) -> Descent:
+    def descend(
+        self, v: Array, goal: Array, bounded: bool = True, firm: bool = False, mode: int = PLAIN
+    ) -> Descent:
         """Gauss-Newton from ``v`` to the set-point ``goal`` ``(n_y,)``; not ``bounded``: only kept bounds hold.
 
-        Second derivatives of the deviation are used once a whole step fails, those of the distance from the operating
-        point once steps at the set-point do not contract. ``firm``: ends as soon as its end is not sure.
+        Second derivatives of the deviation are used from the start (``CURVED``) or once a whole step fails, those of
+        the distance from the operating point once steps at the set-point do not contract. ``firm``: ends as soon as its
+        end is not sure.
         """
         at, done, sure = self._point(v, goal), False, True
-        passed, before, weight, mode, good, near = [at], np.inf, LEAST_WEIGHT, PLAIN, at, False
+        passed, before, weight, good, near = [at], np.inf, LEAST_WEIGHT, at, False
         slopes = np.full((self._tracked.size, self._leans.size), np.nan)
         for _ in range(ITERATIONS):
             if firm and not sure:

@@ -585,16 +585,17 @@ static void place(const hmpc_steady *from, real *v) {
 }
 
 /* Gauss-Newton method from v; bounded: within the bounds of states and outputs; firm: ends as soon as its end is not
-   sure. Second derivatives of the deviation are used once a whole step fails, those of the distance from the operating
+   sure. Second derivatives of the deviation are used from the start (CURVED) or once a whole step fails, those of the
+   distance from the operating
    point once steps at the set-point do not contract. */
 static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, int firm,
-                    hmpc_descent *found) {
+                    int mode, hmpc_descent *found) {
   hmpc_search *const work = &s->search;
   hmpc_point *const at = &work->at, *const after = &work->after;
   real step[NT], there[NT], before = HMPC_HUGE, off = R(0.0), apart = R(0.0);
   real lacks[HMPC_TARGET_ITERATIONS + 1], offs[HMPC_TARGET_ITERATIONS + 1];
   real weight = HMPC_TARGET_LEAST_WEIGHT;
-  int done = 0, sure = 1, mode = PLAIN, near = 0, tracked = 0, n = 0;
+  int done = 0, sure = 1, near = 0, tracked = 0, n = 0;
   for (int i = 0; i < HMPC_NY; ++i) tracked += q_y[i] > R(0.0);
   look(s, v, goal, w, at);
   lacks[0] = at->lacks;
@@ -733,7 +734,7 @@ static int follow(hmpc_state *s, const real *v, const real *y, const real *w, in
     for (int j = 0; j < HMPC_ND && !v; ++j) work->d[j] = to * s->d[j];
     for (int j = 0; j < HMPC_NW && !v; ++j) work->w[j] = w_rest[j] + to * (w[j] - w_rest[j]);
     for (int i = 0; i < HMPC_NY; ++i) towards[i] = begun[i] + to * (y[i] - begun[i]);
-    descend(s, at, towards, work->w, 1, sure, found);
+    descend(s, at, towards, work->w, 1, sure, PLAIN, found);
     if (found->at.steady && (found->sure || !sure)) {
       arrived = to >= R(1.0);
       memcpy(at, found->v, sizeof at);
@@ -772,16 +773,19 @@ static int search(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const h
   hmpc_descent trial;
   const int known = start && start->steady ? 1 : 0;
   real first[NT];
-  int n = 0;
+  int n = 0, turns = 0;
+  /* an input within its limits beyond reach of the set-point: there an output turns */
+  for (int j = 0; j < HMPC_NU && known; ++j)
+    turns |= !start->reached && start->u[j] > u_min[j] && start->u[j] < u_max[j];
   wide = wide && (known || !recent);
   memcpy(work->d, s->d, sizeof(real) * HMPC_ND);
   memcpy(first, target_starts[0], sizeof first);
   if (known) place(start, first);
   if (known || !wide) {
-    descend(s, first, y, w, 1, 0, &work->tried[0]);
+    descend(s, first, y, w, 1, 0, turns ? CURVED : PLAIN, &work->tried[0]);
     n = 1;
     if (work->tried[0].lost && known) {
-      descend(s, target_starts[0], y, w, 1, 0, &trial);
+      descend(s, target_starts[0], y, w, 1, 0, PLAIN, &trial);
       if (trial.at.steady && trial.off < work->tried[0].off) work->tried[0] = trial;
     }
     *found = work->tried[0].at;
@@ -796,7 +800,7 @@ static int search(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const h
       }
       ++n;
     }
-    for (int k = 0; k < HMPC_TARGET_STARTS; ++k) descend(s, target_starts[k], y, w, 1, 0, &work->tried[n++]);
+    for (int k = 0; k < HMPC_TARGET_STARTS; ++k) descend(s, target_starts[k], y, w, 1, 0, PLAIN, &work->tried[n++]);
     const int chosen = best(work, n);
     if (chosen >= 0 || follow(s, known ? first : NULL, y, w, 0, &trial)) {
       *found = chosen >= 0 ? work->tried[chosen].at : trial.at;
@@ -805,7 +809,7 @@ static int search(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const h
   }
   *found = work->tried[0].at;
   for (int k = 0; k <= (wide && known); ++k) {
-    descend(s, k ? target_starts[0] : first, y, w, 0, 0, &trial);
+    descend(s, k ? target_starts[0] : first, y, w, 0, 0, PLAIN, &trial);
     if (trial.at.steady) {
       *found = trial.at;
       return wide;
