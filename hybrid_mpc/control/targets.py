@@ -12,6 +12,7 @@ from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.equilibrium import (
     CURVED,
+    NEAR,
     PLAIN,
     REACHED,
     WAIT,
@@ -145,9 +146,10 @@ class Targets:
         tried: list[Descent] = []
         if given is not None or not wide:
             # an input within its limits beyond reach of the set-point: there an output turns
-            limits = self._ocp.u_min, self._ocp.u_max
             turns = start is not None and start.steady and not start.reached
-            turns = turns and bool(np.any((start.u > limits[0]) & (start.u < limits[1])))
+            if turns and start is not None:
+                near = NEAR * self.scale[m.n_x + m.n_h :]
+                turns = bool(np.any((start.u > self._ocp.u_min + near) & (start.u < self._ocp.u_max - near)))
             found = search.descend(first, goal, mode=CURVED if turns else PLAIN)
             if self._lost(found) and given is not None:
                 other = search.descend(self.beside[0], goal)

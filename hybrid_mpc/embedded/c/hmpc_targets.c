@@ -775,8 +775,10 @@ static int search(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const h
   real first[NT];
   int n = 0, turns = 0;
   /* an input within its limits beyond reach of the set-point: there an output turns */
-  for (int j = 0; j < HMPC_NU && known; ++j)
-    turns |= !start->reached && start->u[j] > u_min[j] && start->u[j] < u_max[j];
+  for (int j = 0; j < HMPC_NU && known; ++j) {
+    const real near = HMPC_TARGET_NEAR * target_scale[HMPC_NZ + j];
+    turns |= !start->reached && start->u[j] > u_min[j] + near && start->u[j] < u_max[j] - near;
+  }
   wide = wide && (known || !recent);
   memcpy(work->d, s->d, sizeof(real) * HMPC_ND);
   memcpy(first, target_starts[0], sizeof first);
