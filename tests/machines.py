@@ -7,7 +7,7 @@ import numpy as np
 from online_models import StatePlant, rk4
 from scipy.optimize import brentq
 
-from hybrid_mpc import ExtendedKalmanFilter, HybridModel, Signal
+from hybrid_mpc import Disturbance, ExtendedKalmanFilter, HybridModel, Signal
 
 AREA, PIPE, GRAVITY = 0.02, 1.2e-4, 9.81
 LEVEL, PUMP, INFLOW = 0.30, 1.8e-4, 4e-5
@@ -123,4 +123,19 @@ def ventilated():
         "room", 120.0, (air, replace(percent, name="opening")), (percent,), (air,), x=x, u=u, w=w, y=x[0],
         x_next=x + 120.0 * xdot, xdot=xdot, disturbances=(Signal("out", "degC"), Signal("sun", "W/m^2")),
         nominal_w=(15.0, 300.0), nominal_x=(18.7084, 20.0), nominal_u=(20.0,),
+    )  # fmt: skip
+
+
+def heated():
+    """A room with a heater and a vent that cools most half open; a motor moves the vent. A load heats the room."""
+    x, u, w = ca.MX.sym("x", 2), ca.MX.sym("u", 2), ca.MX.sym("w", 2)
+    exchange = 0.55 + 0.06 * x[1] * (1.0 - 0.01 * x[1])
+    xdot = ca.vertcat((0.12 * u[0] + 0.015 * w[1] - exchange * (x[0] - w[0])) / 1200.0, (u[1] - x[1]) / 150.0)
+    air, percent = Signal("T", "degC", -5.0, 45.0), Signal("heater", "%", 0.0, 100.0)
+    return HybridModel.of(
+        "heated", 60.0, (air, replace(percent, name="opening")), (percent, replace(percent, name="vent")), (air,),
+        x=x, u=u, w=w, y=x[0], x_next=x + 60.0 * xdot, xdot=xdot,
+        disturbances=(Signal("out", "degC"), Signal("sun", "W/m^2")), nominal_w=(10.0, 100.0),
+        nominal_x=(18.0, 10.0), nominal_u=((1.09 * 8.0 - 1.5) / 0.12, 10.0),
+        disturbance_model=(Disturbance("rate", "T", 1e-3),),
     )  # fmt: skip

@@ -16,7 +16,7 @@ from hybrid_mpc.identify.simulation import rest_of
 from hybrid_mpc.loop.faults import Fault
 from hybrid_mpc.machine.prior import Prior
 from hybrid_mpc.machine.signals import Signal
-from hybrid_mpc.model.equilibrium import RateEquations, rate_search
+from hybrid_mpc.model.equilibrium import Range, RateEquations, rate_search
 from hybrid_mpc.scenario import Scenario, Task
 
 Array = NDArray[np.float64]
@@ -72,16 +72,23 @@ class _Rest:
             equations.xdot, self.w, self.prior.p, equations.output if self.control.n_y else None
         )
 
-    def moved(self, j: Sequence[int], by: float, unit: Array) -> tuple[Array, Array] | None:
+    def moved(self, j: Sequence[int], by: float, unit: Array, room: float) -> tuple[Array, Array] | None:
         """The nearest steady state at which the tracked signals ``j`` differ by ``by``; None if there is none.
 
-        They are met within a millionth of ``unit`` ``(len(j),)``.
+        They are met within a millionth of ``unit`` ``(len(j),)``, with inputs that use at most the share ``room`` of
+        the distance to their limits.
         """
+        c, open_, outputs = self.control, np.full(len(self.x), np.inf), np.full(len(self.signals), np.inf)
+        bounds = Range(
+            np.concatenate([-open_, self.u - room * (self.u - c.u_min)]),
+            np.concatenate([open_, self.u + room * (c.u_max - self.u)]),
+            np.ones(len(self.x) + len(self.u), dtype=bool), -outputs, outputs,
+        )  # fmt: skip
         own, start = list(j), np.concatenate([self.x, self.u])
         goal, root = self.tracked(self.x, self.u), np.zeros(len(self.signals))
         goal[own] += by
         root[own] = 1.0 / unit
-        found = rate_search(self.equations, self.sizes(), start, root).descend(start, goal)
+        found = rate_search(self.equations, self.sizes(), start, root, bounds=bounds).descend(start, goal)
         return (found.v[: len(self.x)], found.v[len(self.x) :]) if found.reached else None
 
     def settled(self) -> _Rest:
@@ -90,7 +97,7 @@ class _Rest:
         A fit changes parameters and so the steady state. Without such a state the point itself is returned.
         """
         own = np.flatnonzero(self.weights > 0)[: len(self.u)]
-        found = self.moved(own.tolist(), 0.0, 1.0 / np.sqrt(self.weights[own]))
+        found = self.moved(own.tolist(), 0.0, 1.0 / np.sqrt(self.weights[own]), 1.0)
         inside = found is not None and all(
             np.all((v >= low) & (v <= high))
             for v, low, high in (
@@ -164,9 +171,12 @@ def default_tasks(scenario: Scenario, values: Mapping[str, float] | None = None)
         )
     steps = _steps(rest)
     if not steps:
+        pairs = zip(prior.inputs, rest.u, control.u_min, control.u_max, strict=True)
+        ends = ", ".join(s.name for s, u, low, high in pairs if not low < u < high)
         raise InputError(
             f"{why}no weighted signal of the control problem can reach another steady state within half the distance "
-            "to its limits. Give tasks=(Task(...),). [HM-CHECK-008]"
+            f"to every limit{f'; inputs at a limit: {ends}' if ends else ''}. Give an operating_point farther from the "
+            "limits, or tasks=(Task(...),). [HM-CHECK-008]"
         )
     return _step_task(rest, steps, dt), _hold_task(rest, dt)
 
@@ -179,7 +189,7 @@ def _steps(rest: _Rest) -> list[tuple[int, float, Array]]:
         size = 10.0 / math.sqrt(rest.weights[j])
         candidates = ((sign, size / 2**k) for k in range(12) for sign in (1.0, -1.0))
         for sign, own in candidates:
-            point = rest.moved([j], sign * own, np.array([own]))
+            point = rest.moved([j], sign * own, np.array([own]), ROOM)
             if point is not None and rest.within(*point):
                 found.append((j, sign * own, rest.tracked(*point)))
                 break

@@ -11,7 +11,11 @@ from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.model.equilibrium import (
+    CURVED,
+    NEAR,
+    PLAIN,
     REACHED,
+    WAIT,
     Descent,
     Range,
     Steady,
@@ -129,33 +133,45 @@ class Targets:
         d = np.zeros(m.n_d) if d is None else vector(d, m.n_d, "d")
         w = m.w if w is None else vector(w, m.n_w, "w")
         given = start.unknowns if start is not None and start.steady else None
+        # searched widely for this set-point not long ago: the last result is followed
+        tracked = self._tracked
+        again = start is not None and np.array_equal(start.goal[tracked], goal[tracked])
+        age = min(start.age + 1, WAIT) if start is not None and again else WAIT
+        recent = age < WAIT
+        wide = wide and (given is not None or not recent)
         if given is None:
             _ = self.begun  # takes thousands of periods: computed with the first plan, not in a later period
         self._equations.d, self._equations.w = d, w
         first = self.beside[0] if given is None else given
         tried: list[Descent] = []
         if given is not None or not wide:
-            found = search.descend(first, goal)
+            # an input within its limits beyond reach of the set-point: there an output turns
+            turns = start is not None and start.steady and not start.reached
+            if turns and start is not None:
+                near = NEAR * self.scale[m.n_x + m.n_h :]
+                turns = bool(np.any((start.u > self._ocp.u_min + near) & (start.u < self._ocp.u_max - near)))
+            found = search.descend(first, goal, mode=CURVED if turns else PLAIN)
             if self._lost(found) and given is not None:
                 other = search.descend(self.beside[0], goal)
                 found = other if other.steady and other.off < found.off else found
-            if found.sure or (found.steady and not wide):
-                return self._steady(found)
+            if found.sure or (found.steady and (recent or not wide)):
+                return self._steady(found, goal, age)
             tried.append(found)
         if wide:
+            age = 0
             for begun in (None,) if given is None else (None, given):
                 led = self._followed(goal, d, w, begun)
                 if led is not None and not self._lost(led):
-                    return self._steady(led)
+                    return self._steady(led, goal, age)
                 tried += [] if led is None else [led]
             tried += [search.descend(v, goal) for v in (*self.beside, *self.run_out)]
             if (best := search.best(tried)) is not None:
-                return self._steady(best)
+                return self._steady(best, goal, age)
             if (led := self._followed(goal, d, w, given, sure=False)) is not None:
-                return self._steady(led)
+                return self._steady(led, goal, age)
         starts = [first, *([self.beside[0]] if wide and given is not None else [])]
         free = [search.descend(v, goal, bounded=False) for v in starts]
-        return self._steady(next((f for f in free if f.steady), tried[0]))
+        return self._steady(next((f for f in free if f.steady), tried[0]), goal, age)
 
     def _followed(
         self, goal: Array, d: Array, w: Array, given: Array | None = None, *, sure: bool = True
@@ -179,10 +195,10 @@ class Targets:
         """Whether a descent missed its set-point at a point where outputs do not respond as at the operating point."""
         return found.steady and found.off > REACHED and bool(np.vdot(found.slopes, self.slopes) < self.flat)
 
-    def _steady(self, found: Descent) -> Steady:
+    def _steady(self, found: Descent, goal: Array, age: int) -> Steady:
         n_x, n_z = self.model.n_x, self.model.n_x + self.model.n_h
         u = np.clip(found.v[n_z:], self._ocp.u_min, self._ocp.u_max)
-        return Steady(found.v[:n_x], found.v[n_x:n_z], u, found.y, found.reached, found.steady)
+        return Steady(found.v[:n_x], found.v[n_x:n_z], u, found.y, found.reached, found.steady, goal, age)
 
     def _undisturbed(self) -> None:
         self._equations.d, self._equations.w = np.zeros(self.model.n_d), self.model.w

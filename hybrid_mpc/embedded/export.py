@@ -66,7 +66,8 @@ the table does not include it.""",
 TARGETS_README = """\
 The set-point is one of outputs, `goal.y`. Every step computes its steady state (`s.steady`), starting from the previous
 one: two or three iterations, and more after a jump of set-point or disturbance. If this fails, the search starts from
-every start point, with at most `HMPC_TARGET_ITERATIONS` iterations each.
+every start point, with at most `HMPC_TARGET_ITERATIONS` iterations each, and again for the same set-point after
+`HMPC_TARGET_WAIT` steps at the earliest.
 
 """
 

@@ -33,7 +33,7 @@ from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
 from hybrid_mpc.estimate.switching import NEGLIGIBLE, Filter, SwitchingFilter
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, tracked_values
 from hybrid_mpc.loop.guard import Guard
-from hybrid_mpc.model import equilibrium
+from hybrid_mpc.model import active_set, equilibrium
 from hybrid_mpc.model.model import HybridModel, output_with_jacobian
 from hybrid_mpc.model.riccati import dare
 from hybrid_mpc.watch.monitor import Monitor
@@ -51,9 +51,10 @@ FIRST = 25
 SEARCH: Mapping[str, tuple[str, str]] = {
     "STEADY": (repr(equilibrium.STEADY), "1e-5"), "STILL": (repr(equilibrium.STILL), "1e-4"),
     "NEAR": (repr(equilibrium.NEAR), "1e-3"), "REACHED": (repr(equilibrium.REACHED), "1e-3"),
-    "RANK": (repr(equilibrium.RANK), "1e-5"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
+    "RANK": (repr(equilibrium.RANK), "1e-5"),
+    "ASIDE": (repr(equilibrium.ASIDE), "1e-2"), "FREE": (repr(equilibrium.FREE), "1e-3"), "DAMPING": ("1e-12", "1e-7"),
     **{name: (repr(getattr(equilibrium, name)),) * 2 for name in (
-        "STALLED", "CREEPS", "CONTRACTS", "FOLLOWED", "LEAST_PART", "LEAST_WEIGHT", "EQUAL",
+        "STALLED", "CREEPS", "CONTRACTS", "FOLLOWED", "LEAST_PART", "LEAST_WEIGHT", "EQUAL", "STIFF",
     )}, "VIOLATED": ("1e-12", "1e-6"),
     "ROUNDING": ("1e-15", "1e-7"), "AWAY": (repr(equilibrium.AWAY), repr(equilibrium.AWAY)),
 }  # fmt: skip
@@ -144,6 +145,7 @@ def make_sources(
         "SOFT_D": int(any(np.any(np.array(f.jac_sparsity(0, 2).get_triplet()[1]) < model.n_d) for f in soft.functions)),
         "TARGET_ITERATIONS": equilibrium.ITERATIONS, "TARGET_SETTLING": equilibrium.SETTLING,
         "TARGET_WITHIN": equilibrium.WITHIN, "TARGET_PARTS": equilibrium.MOST_PARTS, "TARGET_STARTS": len(aims),
+        "TARGET_WAIT": equilibrium.WAIT,
         "TARGET_NEAREST": len(aims) - 1 if problem.targets is not None and problem.targets.run_out else 0,
         "CURVED": int(curved), "STAGE_COST": int(staged), "COST_MOVES": int(staged and cost.n_p > 0),
         "OUTPUT_ROWS": int(ocp.n_y > 0 and not staged), "STARTS": len(ocp.starts),
@@ -253,12 +255,15 @@ def _config(sizes: Mapping[str, int], single: bool, names: list[str], watched: W
     hard = "".join(f"   {i}: {comment(name)}\n" for i, name in enumerate(names) if name)
     defined += f"/* Hard bounds by their place in given_way:\n{hard}*/\n" if hard else ""
     # tolerances of the QP in single precision follow from the seven digits of a float
-    exact = ("2e-5", "1e-4", "2e-3", "1e-3", "1e-3") if single else (
-        "1e-10", "1e-12", repr(KKT_TOLERANCE), repr(BOUND_TOLERANCE), repr(KEPT)
-    )  # fmt: skip
     tolerances = [
-        *zip(("VIOLATED", "DEPENDENT", "KKT_TOLERANCE", "BOUND_TOLERANCE", "KEPT"), exact, strict=True)
-    ]
+        (name, floats if single else repr(value))
+        for name, floats, value in (
+            ("VIOLATED", "2e-5", active_set.PRIMAL_TOLERANCE), ("LEAST_SHARE", "1.0", active_set.LEAST_SHARE),
+            ("ROUNDING", "1e-7", active_set.ROUNDING), ("DEPENDENT", "1e-4", active_set.DEPENDENT),
+            ("KKT_TOLERANCE", "2e-3", KKT_TOLERANCE), ("BOUND_TOLERANCE", "1e-3", BOUND_TOLERANCE),
+            ("KEPT", "1e-3", KEPT),
+        )
+    ]  # fmt: skip
     tolerances += [(f"TARGET_{name}", value[single]) for name, value in SEARCH.items()]
     tolerances += [(f"START_{name}", value[single]) for name, value in START.items()]
     defined += "".join(f"#define HMPC_{name} {number(value)}\n" for name, value in watched.numbers.items())

@@ -15,7 +15,7 @@ from hybrid_mpc.control.ocp import OCP, Limits
 from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status
 from hybrid_mpc.embedded.generate import SOURCES, Sources, bound_names, make_sources, template
 from hybrid_mpc.estimate.kalman import Estimate
-from hybrid_mpc.model.equilibrium import Steady
+from hybrid_mpc.model.equilibrium import WAIT, Steady
 from hybrid_mpc.model.model import HybridModel
 from nn_export.codegen import compile_library
 
@@ -36,15 +36,17 @@ const size_t hmpc_places[] = {
   sizeof(hmpc_state), PLACE(x), PLACE(h), PLACE(d), PLACE(w), PLACE(plan.u), PLACE(plan.z), PLACE(plan.w),
   PLACE(plan.cost), PLACE(plan.excess), PLACE(working.kkt), PLACE(linear.largest_defect), PLACE(u), PLACE(status),
   PLACE(source), PLACE(age), PLACE(working.iterations), PLACE(steady.x), PLACE(steady.h), PLACE(steady.u),
-  PLACE(steady.y), PLACE(steady.reached), PLACE(steady.steady), PLACE(plan.given_way)
+  PLACE(steady.y), PLACE(steady.reached), PLACE(steady.steady), PLACE(plan.given_way),
+  PLACE(steady.goal), PLACE(steady.age)
 };
 """
 """C that exports the offsets of the state's fields."""
 FIELDS = (
     "x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect", "u", "status", "source", "age",
     "iterations", "steady_x", "steady_h", "steady_u", "steady_y", "reached", "steady", "given_way",
+    "steady_goal", "steady_age",
 )  # fmt: skip
-WHOLE = ("status", "source", "age", "iterations", "reached", "steady")
+WHOLE = ("status", "source", "age", "iterations", "reached", "steady", "steady_age")
 
 
 class Goal(ctypes.Structure):
@@ -161,8 +163,9 @@ class NativeController(SplitController):
         ]
         self._library.c.hmpc_load_plan(self._state.at, *(v.ctypes.data for v in given))
         view, steady = self._state.view, plan.steady
-        view["steady"][0] = steady is not None and steady.steady
+        view["steady"][0], view["steady_age"][0] = steady is not None and steady.steady, WAIT
         if steady is not None:
+            view["steady_goal"][:], view["steady_age"][0] = steady.goal, steady.age
             view["steady_x"][:], view["steady_h"][:], view["steady_u"][:] = steady.x, steady.h, steady.u
 
     def _given_way(self) -> dict[str, float]:
@@ -177,8 +180,10 @@ class NativeController(SplitController):
         """Steady state of the last solve for the first row of the outputs' reference; None without such a reference."""
         if not self.ocp.n_y:
             return None
-        x, h, u, y = (self._state.view[f"steady_{name}"].copy() for name in "xhuy")
-        return Steady(x, h, u, y, *(bool(self._state.view[name][0]) for name in ("reached", "steady")))
+        view = self._state.view
+        x, h, u, y, goal = (view[f"steady_{name}"].copy() for name in ("x", "h", "u", "y", "goal"))
+        reached, steady, age = (int(view[name][0]) for name in ("reached", "steady", "steady_age"))
+        return Steady(x, h, u, y, bool(reached), bool(steady), goal, age)
 
 
 def goal_of(
@@ -214,6 +219,7 @@ class State:
             "x": (n["NX"],), "h": (n["NH"],), "d": (n["ND"],), "w": (n_w,), "plan_u": (n["N"], n["NU"]),
             "plan_z": (n["N"] + 1, -(-n_z // 8) * 8), "plan_w": (n["N"], max(1, n_w)), "u": (n["NU"],),
             "steady_x": (n["NX"],), "steady_h": (n["NH"],), "steady_u": (n["NU"],), "steady_y": (n["NY"],),
+            "steady_goal": (n["NY"],),
             "given_way": (max(1, n["SOFT_X"] + n["SOFT_E"]),),
         }  # fmt: skip
         size, *places = library.places

@@ -40,6 +40,7 @@ from hybrid_mpc.loop.preview import (
     n_tracked,
     refuse_beyond,
     shortest_way,
+    unreached,
     with_unknown,
 )
 from hybrid_mpc.machine.signals import nearest_turn as moved_by_turns
@@ -480,6 +481,14 @@ class Loop:
         The loop follows such a set-point as far as the limits allow.
         """
         return beyond_range(self.previewed[0], self.problem)
+
+    @property
+    def unreached(self) -> str:
+        """Why the target of this period's plan is not at the set-point of outputs, as text; else empty.
+
+        Either no steady state was found, or it names outputs, the nearest values, and inputs at a limit.
+        """
+        return unreached(self.decision.solution.steady, self.problem)
 
     @property
     def safe_input(self) -> Array | None:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybrid_mpc.control.ocp import OCP
 from hybrid_mpc.control.problem import Problem
 from hybrid_mpc.errors import InputError
+from hybrid_mpc.model.equilibrium import Steady
 from hybrid_mpc.model.limits import check_function, floats, sampled
 
 Array = NDArray[np.float64]
@@ -147,6 +148,21 @@ def beyond_range(reference: Array, problem: Problem) -> str:
                 f"{s.name} = {wrong[0]:g} {s.unit} is outside its range {s.lower:g} to {s.upper:g} {s.unit}"
             )
     return ""
+
+
+def unreached(steady: Steady | None, problem: Problem) -> str:
+    """Why a plan's steady state is not at its set-point, as text; empty if it is, or if there is no set-point."""
+    if steady is None or steady.reached:
+        return ""
+    if not steady.steady:
+        return "no steady state found: the plan returns to the operating point"
+    ocp, model = problem.ocp, problem.model
+    rows = zip(ocp.q_y, model.outputs, steady.y, steady.goal, strict=True)
+    off = [f"{s.name} reaches {y:.4g}, not {goal:.4g} {s.unit}" for weight, s, y, goal in rows if weight > 0]
+    near = 1e-6 * ocp.input_range
+    ended = (steady.u <= ocp.u_min + near) | (steady.u >= ocp.u_max - near)
+    ends = [s.name for s, end in zip(model.inputs, ended, strict=True) if end]
+    return "; ".join([*off, *([f"at a limit: {', '.join(ends)}"] if ends else [])])
 
 
 def refuse_beyond(reference: Array, problem: Problem) -> None:

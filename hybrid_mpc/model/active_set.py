@@ -15,8 +15,14 @@ Array = NDArray[np.float64]
 Active = NDArray[np.int8]
 """State of a QP's rows: 1 on the upper bound, -1 on the lower, 2 and -2 beyond a penalised bound, 0 inactive."""
 
-PRIMAL_TOLERANCE = 1e-9
-"""Violation above which a row becomes active."""
+PRIMAL_TOLERANCE = 1e-10
+"""Violation above which a row becomes active: the distance of the unknowns from its bound, in their scale."""
+LARGE, LOOSEST = 1e3, 1e-8
+"""Multiplier above which the tolerance grows in proportion, as rounding does, and the largest tolerance."""
+LEAST_SHARE = 1e-4
+"""Smallest share of the tolerance, for rows that hardly depend on the unknowns."""
+ROUNDING = 1e-15
+"""Rounding error of a row's value, over its bounds."""
 CHANGES = 25
 """Most changes of the whole active set; a warm start needs 1 to 10."""
 PATIENCE = 3
@@ -50,6 +56,27 @@ class RowQP:
     def excess(self, values: Array) -> Array:
         """Violation of the bounds by values ``(R,)``; negative inside."""
         return np.maximum(values - self.upper, self.lower - values)
+
+    def tolerance(self, multipliers: Array) -> Array:
+        """Violations ``(R,)`` above which rows become active.
+
+        A row that hardly depends on the unknowns needs a smaller one: its violation over its norm is the distance.
+        """
+        within = min(
+            max(1.0, float(np.abs(multipliers).max(initial=0.0)) / LARGE) * PRIMAL_TOLERANCE, LOOSEST
+        )
+        return within * self._shares + self._rounding
+
+    @cached_property
+    def _shares(self) -> Array:
+        norms = np.sqrt(np.einsum("ij,ij->i", self.a, self.a))
+        return np.concatenate([np.ones(self.g.size), np.clip(norms, LEAST_SHARE, 1.0)])
+
+    @cached_property
+    def _rounding(self) -> Array:
+        bounds = np.abs([self.lower, self.upper])
+        bounds[np.isinf(bounds)] = 0.0
+        return np.asarray(ROUNDING * bounds.max(axis=0))
 
     @np.errstate(invalid="ignore")  # values that are not finite show in the result
     def residuals(self, s: Array, multipliers: Array) -> tuple[float, float, float]:
@@ -140,8 +167,10 @@ class ActiveSet:
         if not self._finite:
             return Found(np.full(self._n, np.nan), np.full(none.size, np.nan), none)
         start = none if active is None or active.size != none.size else active
-        if not start.any() and self._qp.excess(self._at_free).max() <= PRIMAL_TOLERANCE:
-            return Found(self._free, np.zeros(none.size), none)
+        if not start.any():
+            unpushed = np.zeros(none.size)
+            if (self._qp.excess(self._at_free) <= self._qp.tolerance(unpushed)).all():
+                return Found(self._free, unpushed, none)
         return (
             self.all_at_once(start)
             or (self.all_at_once(none) if start.any() else None)  # after a jump the last set is useless
@@ -168,7 +197,7 @@ class ActiveSet:
                 0.0  # of the others, rows join whose violation exceeds that of their neighbours in time
             )
             near = np.maximum(excess[self._later], excess[self._earlier])
-            after *= excess >= np.maximum(near, PRIMAL_TOLERANCE)
+            after *= excess >= np.maximum(near, qp.tolerance(on.push))
             after[on.rows] = mine
             wrong = int(np.count_nonzero(after != active))
             if not wrong:
@@ -199,7 +228,8 @@ class ActiveSet:
             values = qp.values(s)
             excess = qp.excess(values)
             if row < 0:
-                worst = np.where((active == 0) & (excess > PRIMAL_TOLERANCE), excess / size, 0.0)
+                joins = (active == 0) & (excess > qp.tolerance(multipliers))
+                worst = np.where(joins, excess / size, 0.0)
                 row = int(np.argmax(worst))
                 if worst[row] <= 0:
                     return self._refined(Found(s, multipliers, active))

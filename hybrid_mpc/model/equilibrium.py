@@ -38,6 +38,16 @@ the share ``CREEPS``. Successful descents fall far more, but along a curved bran
 steps are short at first."""
 LEAST_WEIGHT = 100.0
 """Smallest weight of the residual, over that of the deviation from the set-point, in the merit of a descent."""
+PLAIN, CURVED, LEANING = range(3)
+"""Second derivatives in a step: none, those of the deviation from the set-point, those of the distance from the
+operating point."""
+STIFF = 100.0
+"""Curvature against leaving bounds, over the norm of the second derivatives, where these are not positive definite."""
+ASIDE = 1e-5
+"""Step of the differences that measure curvature, in scales of the unknowns."""
+WAIT = 20
+"""Searches from the last result, for the same set-point, between two from several starts, which take a hundred times
+as long."""
 AWAY = 1e6
 """Distance from its start, in scales of the unknowns, at which a descent has diverged."""
 STILL = 1e-6
@@ -69,6 +79,8 @@ class Steady:
         y: Outputs ``(n_y,)``, with the effect of unmeasured disturbances.
         reached: Whether the outputs with weights are at the set-point.
         steady: Whether it is a steady state of the model; False: none was found, and this is the last iterate.
+        goal: Set-point ``(n_y,)`` that it was searched for.
+        age: Searches for this set-point since the last one from several starts, each from the result before.
     """
 
     x: Array
@@ -77,6 +89,8 @@ class Steady:
     y: Array
     reached: bool
     steady: bool
+    goal: Array
+    age: int
 
     @property
     def unknowns(self) -> Array:
@@ -282,6 +296,7 @@ class SteadySearch:
         place = np.full(n_v, -1)
         place[self._sought] = np.arange(self._sought.size)
         self._leaning, self._leans = place[leans][place[leans] >= 0], leans[place[leans] >= 0]
+        self._spare = self._leaning.size > self._tracked.size  # inputs that set-points do not determine
         bounds = Range.none(n_v, root.size) if bounds is None else bounds
         self.bounds = bounds
         finite = (np.isfinite(bounds.lower) | np.isfinite(bounds.upper)) & (place >= 0)
@@ -296,39 +311,66 @@ class SteadySearch:
         self._seen = np.flatnonzero(np.isfinite(bounds.y_lower) | np.isfinite(bounds.y_upper))
 
     @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
-    def descend(self, v: Array, goal: Array, bounded: bool = True) -> Descent:
-        """Gauss-Newton from ``v`` to the set-point ``goal`` ``(n_y,)``; not ``bounded``: only kept bounds hold."""
+    def descend(
+        self, v: Array, goal: Array, bounded: bool = True, firm: bool = False, mode: int = PLAIN
+    ) -> Descent:
+        """Gauss-Newton from ``v`` to the set-point ``goal`` ``(n_y,)``; not ``bounded``: only kept bounds hold.
+
+        Second derivatives of the deviation are used from the start (``CURVED``) or once a whole step fails, those of
+        the distance from the operating point once steps at the set-point do not contract. ``firm``: ends as soon as its
+        end is not sure.
+        """
         at, done, sure = self._point(v, goal), False, True
-        passed, before, weight = [at], np.inf, LEAST_WEIGHT
+        passed, before, weight, good, near = [at], np.inf, LEAST_WEIGHT, at, False
         slopes = np.full((self._tracked.size, self._leans.size), np.nan)
         for _ in range(ITERATIONS):
-            step, slopes = self._newton(at, goal, bounded)
+            if firm and not sure:
+                break
+            step, slopes = self._newton(at, goal, bounded, mode)
             if step is None or not np.all(np.isfinite(step)):
                 break
             size = float(np.max(np.abs(step / self.scale), initial=0.0))
             if size <= self._steady:
                 done = at.lacks <= STILL
                 break
+            spare = self._spare and mode != LEANING and at.lacks <= STILL and at.off <= REACHED
+            if spare and size > CONTRACTS * before:
+                mode, good, near, before = LEANING, at, size < NEAR, np.inf  # the same point again
+                continue
+            if mode == LEANING:
+                if not size <= CONTRACTS * before:
+                    break
+                before, at = size, self._settled(at.v + step, goal)
+                continue
             # exact penalty: the step must reduce the merit to first order (Nocedal, Wright, 2006, section 18.3)
             worse = self._deviation(at.y + at.y_by_v @ step, goal) - at.off
             weight = max(weight, 2.0 * worse / at.lacks) if at.lacks > STILL else weight
-            sure = sure and (size < NEAR or size <= CONTRACTS * before)
-            before, share, merit = size, 1.0, at.merit(weight)
+            last, share, merit = before, 1.0, at.merit(weight)
+            before = size
             after = self._settled(at.v + step, goal)
             if not after.merit(weight) < merit and size >= NEAR:
                 # watchdog: on a curved branch a step leaves it to second order, and the next step returns to it
-                second = self._newton(after, goal, bounded)[0]
+                second = self._newton(after, goal, bounded, mode)[0]
                 again = np.inf if second is None else float(np.max(np.abs(second / self.scale), initial=0.0))
                 if second is not None and np.isfinite(again):
                     then = self._settled(after.v + second, goal)
                     if then.merit(weight) < merit:
                         sure = sure and (again < NEAR or again <= CONTRACTS * size)
                         after, before = then, again
+            if not after.merit(weight) < merit and size >= NEAR and at.off > REACHED and mode == PLAIN:
+                mode, before = CURVED, last  # the same point again
+                continue
+            sure = sure and (size < NEAR or size <= CONTRACTS * last)
+            # where an output turns, the merit is flat, and rounding hides what the last steps gain
+            flat = mode == CURVED and size < NEAR and size <= CONTRACTS * last
             # smallest share of a step that is tried
-            while not after.merit(weight) < merit and share > 1e-3:
+            while not (flat or after.merit(weight) < merit) and share > 1e-3:
                 share, sure = 0.5 * share, sure and size < NEAR
                 after = self._settled(at.v + share * step, goal)
-            if not after.merit(weight) < merit:
+            if not (flat or after.merit(weight) < merit):
+                if spare:
+                    mode, good, near, before = LEANING, at, size < NEAR, np.inf
+                    continue
                 done = size < NEAR and at.lacks <= STILL  # only rounding is left
                 break
             at = after
@@ -340,6 +382,12 @@ class SteadySearch:
                 stalled = at.lacks > max(STALLED * past.lacks, STILL)
                 if stalled and at.merit(weight) > CREEPS * past.merit(weight):
                     break
+        if mode == LEANING and not done:
+            at, done, sure = (
+                good,
+                True,
+                sure and near,
+            )  # the set-point is reached, farther from the operating point
         off = float(np.max(np.abs(self._root * (at.y - goal)[self._tracked]), initial=0.0))
         return Descent(at.v, at.y, off, slopes, done, done and sure)
 
@@ -364,7 +412,7 @@ class SteadySearch:
             to = min(1.0, done + part)
             if before is not None:
                 before(to)
-            found = self.descend(v, begun + to * (goal - begun))
+            found = self.descend(v, begun + to * (goal - begun), firm=sure)
             if found.steady and (found.sure or not sure):
                 if to >= 1.0:
                     return found
@@ -404,8 +452,13 @@ class SteadySearch:
         """Scaled residual of the steady state at ``v``."""
         return float(np.sum(np.abs(self.equations.rest(v)[0] / self.size)))
 
-    def _newton(self, at: _Point, goal: Array, bounded: bool) -> tuple[Array | None, Array]:
-        """The step of the linearized problem (None if its QP has no solution), and :meth:`slopes` there."""
+    def _newton(
+        self, at: _Point, goal: Array, bounded: bool, mode: int = PLAIN
+    ) -> tuple[Array | None, Array]:
+        """The step of the linearized problem (None if its QP has no solution), and :meth:`slopes` there.
+
+        ``mode`` says which second derivatives along the steady states it has.
+        """
         scale, v, y = self.scale, at.v, at.y
         # scaled rows, so that their rank does not depend on units
         rest, e, j = at.rest / self._own, at.rest_by_v * scale / self._own[:, None], at.y_by_v * scale
@@ -426,8 +479,22 @@ class SteadySearch:
         unseen = vt[int(np.sum(s > RANK * size)) :]
         move = along[self._leaning]
         inward = unseen.T @ unseen
-        h = sees.T @ sees / size**2 + FREE * inward @ (move.T @ move) @ inward
-        g = -(sees.T @ error / size**2 + FREE * inward @ (move.T @ far))
+        h, g = sees.T @ sees, -sees.T @ error
+        leaning, towards = inward @ (move.T @ move) @ inward, inward @ (move.T @ far)
+        if mode == PLAIN:
+            h, g = h / size**2 + FREE * leaning, g / size**2 - FREE * towards
+        else:
+            # unknowns at bounds, which have multipliers of their own
+            inside = (v - self.bounds.lower > NEAR * scale) & (self.bounds.upper - v > NEAR * scale)
+            inside = inside[self._sought]
+            bend, turned = self._bend(at, goal, along, onto, inside, mode)
+            if mode == CURVED:
+                size = float(np.sqrt(size**2 + np.linalg.norm(bend)))
+                h, g = convex(h / size**2, bend / size**2, along[~inside]), (g + turned) / size**2
+                h, g = h + FREE * leaning, g - FREE * towards
+            else:
+                h, g = h / size**2 + FREE * leaning, g / size**2 + FREE * (inward @ turned - towards)
+                h = convex(h, FREE * inward @ bend @ inward, along[~inside])
         h += 1e-12 * np.trace(h) * np.eye(len(h)) + 1e-14 * np.eye(len(h))
         which, places, low, high = self._all if bounded else self._always
         now = v[which] / scale[which] + onto[places]
@@ -447,6 +514,41 @@ class SteadySearch:
             whole[self._free] = moved
             moved = whole
         return moved * scale, sees @ move.T
+
+    def _bend(
+        self, at: _Point, goal: Array, along: Array, onto: Array, inside: NDArray[np.bool_], mode: int
+    ) -> tuple[Array, Array]:
+        """Second derivatives of the Lagrangian along steady states, and their product with the scaled step ``onto``
+        them, by differences of Jacobians.
+
+        ``CURVED``: of half the square of the deviation from the set-point. Gauss-Newton neglects them, but they matter
+        if a set-point beyond reach is closest where an output turns. ``LEANING``: of half the square of the distance
+        from the operating point at the set-point. ``inside``: unknowns that are not at bounds.
+        """
+        tracked, scale, n_e = self._tracked, self.scale, at.rest.size
+
+        def slopes(point: _Point) -> Array:
+            tracked_rows = self._root[:, None] * point.y_by_v[tracked]
+            found = np.concatenate([point.rest_by_v / self._own[:, None], tracked_rows]) * scale
+            return np.asarray(found[:, self._sought])
+
+        begun = slopes(at)
+        own = begun * inside
+        if mode == CURVED:
+            push = self._root * (at.y - goal)[tracked]
+            multipliers = np.concatenate([-np.linalg.pinv(own[:n_e], RANK).T @ (push @ own[n_e:]), push])
+        else:
+            away = np.zeros(inside.size)
+            away[self._leaning] = ((at.v - self.near) / scale)[self._leans]
+            multipliers = -np.linalg.pinv(own, RANK).T @ (away * inside)
+        far = float(np.linalg.norm(onto)) + 1e-150
+        columns = []
+        for direction in (*along.T, onto / far):
+            v = at.v.copy()
+            v[self._sought] += ASIDE * direction * scale[self._sought]
+            columns.append(along.T @ (multipliers @ (slopes(self._point(v, goal)) - begun)) / ASIDE)
+        bend = np.array(columns[:-1]).reshape(along.shape[1], along.shape[1])
+        return 0.5 * (bend + bend.T), far * columns[-1]
 
     def _settled(self, v: Array, goal: Array) -> _Point:
         """The point with its hidden state settled by Newton's method, or unchanged if that fails. The hidden state on
@@ -482,6 +584,21 @@ class SteadySearch:
     def _deviation(self, y: Array, goal: Array) -> float:
         """Weighted deviation of the outputs from the set-point."""
         return float(np.linalg.norm(self._root * (y - goal)[self._tracked]))
+
+
+def convex(square: Array, bend: Array, held: Array) -> Array:
+    """``square + bend``, made positive definite: by changes of what is at bounds, with the directions ``held``, and if
+    that is not enough, of everything.
+    """
+    size, lengths = float(np.linalg.norm(bend)), np.sum(held**2, axis=1)
+    rows = held[lengths > 0] / np.sqrt(lengths[lengths > 0])[:, None]
+    found = square + bend
+    for more in (STIFF * size * rows.T @ rows, 2.0 * size * np.eye(len(bend))):
+        try:
+            np.linalg.cholesky(found)
+        except np.linalg.LinAlgError:
+            found = found + more
+    return np.asarray(found)
 
 
 def natural_sizes(model: HybridModel) -> Array:
@@ -745,5 +862,7 @@ def bounded_least_squares(h: Array, g: Array, rows: Array, lower: Array, upper: 
     rest = e @ multipliers - f
     if left <= 1e-10 or abs(rest[-1]) < 1e-300:
         return None
-    t = -rest[:-1] / rest[-1]
-    return np.asarray(free + np.linalg.solve(root.T, t))
+    # the active rows again, exactly: t is rounded in proportion to its length
+    on = sides[multipliers > 0]
+    push = np.linalg.lstsq(on @ cho_solve(factor, on.T), gap[multipliers > 0], rcond=None)[0]
+    return np.asarray(free + cho_solve(factor, on.T @ push))

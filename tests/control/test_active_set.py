@@ -113,3 +113,10 @@ def test_a_hessian_that_is_none_gives_no_numbers():
     no = np.zeros((0, 1))
     qp = RowQP(-np.eye(1), np.zeros(1), no, -np.ones(1), np.ones(1), np.full(1, np.inf), np.zeros(1))
     assert np.all(np.isnan(ActiveSet(qp).solve().s))
+
+
+def test_a_row_that_hardly_depends_on_the_unknowns_is_kept_as_exactly():
+    inf, no, upper = np.full(2, np.inf), np.zeros(2), np.array([9.0, 1e-3 - 5e-10])
+    found = ActiveSet(RowQP(np.eye(1), -np.ones(1), np.full((1, 1), 1e-3), -inf, upper, inf, no)).solve()
+    # 1e-3 s <= 1e-3 - 5e-10
+    assert found.s == pytest.approx([1.0 - 5e-7], abs=1e-12)

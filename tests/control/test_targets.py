@@ -7,6 +7,7 @@ import pytest
 from control_parts import plan_of
 from gated import gated, saturated
 from machines import AMBIENT, HEAT, dc_motor, rest_levels, thermal, two_tanks
+from scipy.optimize import minimize_scalar
 
 from hybrid_mpc import (
     OCP,
@@ -26,6 +27,7 @@ from hybrid_mpc import (
     linearize,
 )
 from hybrid_mpc.control import targets as targets_module
+from hybrid_mpc.model.equilibrium import WAIT
 
 TANKS = {"q": [0.0, 0.0], "r": [1e6], "r_delta": [1e6], "u_min": [5e-5], "u_max": [4e-4], "q_y": [1.0]}
 HEATERS = {"q": [0.0] * 2, "r": [0.1] * 2, "r_delta": [0.1] * 2, "u_min": [0.0] * 2, "u_max": [20.0] * 2}
@@ -361,7 +363,7 @@ def test_the_model_s_own_run_ends_where_a_search_may_begin(seed):
     assert found_one_by_one(targets, (0.5, 0.9, 1.2)) == [True] * 3
     without = Targets(gated(seed), GATED)
     without.__dict__["run_out"] = []
-    assert not any(found_one_by_one(without, (0.5, 0.9, 1.2)))
+    assert not all(found_one_by_one(without, (0.5, 0.9, 1.2)))
 
 
 @pytest.mark.parametrize("seed", [4, *(pytest.param(k, marks=pytest.mark.full) for k in (5, 11))])
@@ -392,3 +394,54 @@ def test_an_actuator_that_saturates_gives_all_it_can(w):
     assert found.steady
     assert not found.reached
     np.testing.assert_allclose([*found.y, *found.u], [w[0] + 0.015 * w[1] / exchange, 100.0], rtol=1e-6)
+
+
+HEATED = OCP(20, [0.0, 0.0], [1e-5, 1e-2], [2.5e-3, 2.5e-3], [0.0, 0.0], [100.0, 100.0], q_y=[4.0])
+
+
+def test_a_set_point_beyond_the_vent_opens_it_where_it_cools_most():
+    """Half open; next, from there, second derivatives converge at once, and nothing else is searched."""
+    targets = Targets(machines.heated(), HEATED)
+    found, steps = targets.at([20.0], w=[25.0, 600.0]), []
+    newton = targets._search._newton
+    targets._search._newton = lambda *given: steps.append(given) or newton(*given)
+    for w in ((25.5, 640.0), (24.0, 500.0), (26.0, 700.0)):
+        steps.clear()
+        found = targets.at([20.0], w=w, start=found)
+        assert (found.steady, found.reached) == (True, False)
+        np.testing.assert_allclose(found.y, w[0] + 0.015 * w[1] / 2.05, rtol=1e-9)
+        # the operating point attracts an input to which the output does not respond, with a weight of 1e-6
+        np.testing.assert_allclose(found.u, [0.0, 50.0], atol=1e-4)
+        assert len(steps) < 6
+
+
+@pytest.mark.parametrize("goal", [12.0, 14.0, 20.0])
+def test_of_the_inputs_along_a_curve_the_nearest_to_the_operating_point_is_taken(goal):
+    """The vent's best position by a scalar search; the heater follows from the heat balance."""
+    model = machines.heated()
+    found = Targets(model, HEATED).at([goal])
+
+    def heater(vent):
+        return ((0.55 + 0.06 * vent * (1.0 - 0.01 * vent)) * (goal - 10.0) - 1.5) / 0.12
+
+    def distance(vent):
+        return (heater(vent) - model.u0[0]) ** 2 + (vent - model.u0[1]) ** 2
+
+    best = minimize_scalar(distance, bounds=(0.0, 50.0), method="bounded", options={"xatol": 1e-9}).x
+    assert found.reached
+    np.testing.assert_allclose(found.u, [heater(best), best], atol=1e-5)  # the search's own tolerance
+    slope = (distance(found.u[1] + 1e-4) - distance(found.u[1] - 1e-4)) / 2e-4
+    assert abs(slope) < 1e-5 or found.u[1] < 1e-9
+
+
+def test_a_wide_search_without_success_is_repeated_after_a_while(monkeypatch):
+    targets, calls, last = pumped(lambda u: (u - 0.3) ** 2 + 0.01), [], None
+    monkeypatch.setattr(targets, "_followed", lambda *given, **options: calls.append(given))
+    for _ in range(WAIT):
+        last = targets.at([0.0], start=last)
+    once = len(calls)
+    assert once <= 2  # one search: the way to the set-point, and any steady states on it
+    last = targets.at([0.0], start=last)
+    assert len(calls) == 2 * once
+    targets.at([0.1], start=last)
+    assert len(calls) == 3 * once

@@ -10,7 +10,16 @@ import pytest
 from embedded_parts import needs_compiler
 from gated import gated, saturated
 
-from hybrid_mpc import OCP, CondensedController, Disturbance, HybridModel, Signal, TrueState, with_input_delay
+from hybrid_mpc import (
+    OCP,
+    CondensedController,
+    Disturbance,
+    HybridModel,
+    Signal,
+    SoftBound,
+    TrueState,
+    with_input_delay,
+)
 from hybrid_mpc.embedded.native import NativeController
 
 pytestmark = needs_compiler
@@ -100,6 +109,22 @@ def ventilated():
     return machines.ventilated(), ocp, 3.0
 
 
+def heated(**options):
+    """Heater and vent, whose effect turns."""
+    ocp = OCP(
+        20, [0.0, 0.0], [1e-5, 1e-2], [2.5e-3, 2.5e-3], [0.0, 0.0], [100.0, 100.0], q_y=[4.0], **options
+    )
+    return machines.heated(), ocp, 12.0
+
+
+def heater_or_vent():
+    """Not both: a soft bound on their product hardly depends on the inputs where both are small."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    return heated(
+        soft=[SoftBound(ca.Function("both", [x, u], [u[0] * u[1]]), [-np.inf], [0.0], [0.02], [1e-6])]
+    )
+
+
 CASES = {
     "heaters": lambda: (*parts.heaters(), 8.0),
     "curved": lambda: (*parts.curved(), 8.0),
@@ -111,6 +136,8 @@ CASES = {
     "two levels": two_levels,
     "sticking": sticking,
     "saturating vent": ventilated,
+    "heater and vent": heated,
+    "heater or vent": heater_or_vent,
     "restless": restless,
     "memory": memory,
     "begun at the run's end": lambda: far_from_rest(2),

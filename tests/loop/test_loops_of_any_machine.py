@@ -100,6 +100,9 @@ def test_a_set_point_outside_the_range_of_its_signal_is_refused_at_the_start_and
     assert loop.beyond == ""
     loop.step([0.2], reference=[[20.0]])
     assert "lower = 20 m" in loop.beyond
+    assert "not 20 m; at a limit: pump" in loop.unreached
+    loop.step([0.2], reference=[[0.2]])
+    assert loop.unreached == ""
     result = closed(
         model, TANKS, parts[0], MachinePlant(model), lambda t: np.where(t < 50, 0.3, 20.0)[:, None], 100.0
     )

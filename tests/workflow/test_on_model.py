@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from hybrid_mpc import Bench, InputError, LoopSpec, OperatingPoint, load, load_scenario
+from hybrid_mpc import OCP, Bench, InputError, LoopSpec, OperatingPoint, Prior, Signal, load, load_scenario
 from hybrid_mpc.check.default_tasks import default_tasks
 from hybrid_mpc.compare.loops import DRAWN_PRIOR, drawn_prior, moves_otherwise, stand_in
 from hybrid_mpc.loop.plant import ModelPlant
@@ -228,3 +228,25 @@ def test_drawn_parameters_scatter_as_their_covariance_says_and_keep_their_bounds
     scale = np.where(size > 0, size, 1.0)
     # four deviations of a correlation of 400 draws
     np.testing.assert_allclose(found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.3)
+
+
+class Room(Prior):
+    """A room that is as warm as outside while heater and vent are off."""
+
+    states = outputs = (Signal("T", "degC", -5, 45),)
+    inputs = (Signal("heater", "%", 0, 100), Signal("vent", "%", 0, 100))
+    operating_point = OperatingPoint(x=(15,), u=(0, 0))
+
+    def xdot(self, x, u, w, p):
+        return ((0.12 * u.heater - (0.5 + 0.01 * u.vent) * (x.T - 15)) / 1000,)
+
+
+@pytest.mark.parametrize("u_max", [100, 1e-6])
+def test_a_default_step_moves_inputs_away_from_their_limits(u_max):
+    ocp = OCP(20, [0.0], [1e-5, 1e-2], [2.5e-3, 2.5e-3], [0, 0], [u_max, 100], q_y=[4.0])
+    scenario = replace(two_heaters.scenario, name="room", prior=Room, control=ocp, tasks=())
+    if u_max > 1:
+        assert default_tasks(scenario)[0].title == "A step of T by 5 degC (default task)"
+    else:
+        with pytest.raises(InputError, match=r"inputs at a limit: heater, vent.*HM-CHECK-008"):
+            default_tasks(scenario)

@@ -76,6 +76,8 @@ typedef struct {
   hmpc_real x[HMPC_NX], h[HMPC_DIM(HMPC_NH)], u[HMPC_NU], y[HMPC_NY];
   int reached; /* 1: the outputs equal the set-point; 0: the nearest outputs that limits and bounds allow */
   int steady;  /* 0: no steady state was found, the operating point is used */
+  hmpc_real goal[HMPC_NY]; /* set-point that it was searched for */
+  int age;                 /* searches for it since the last one from several starts */
 } hmpc_steady;
 
 /* The working set of the QP, and the Cholesky factor of the products of its rows. */
@@ -153,11 +155,11 @@ typedef struct {
 
 /* Memory of the search, see hmpc_targets.c; d, w: disturbances during the search. */
 typedef struct {
-  hmpc_point at, after, settled, kept;
+  hmpc_point at, after, settled, kept, good;
   hmpc_descent tried[HMPC_TARGET_STARTS + 3];
   hmpc_real d[HMPC_DIM(HMPC_ND)], w[HMPC_DIM(HMPC_NW)];
-  hmpc_real a[HMPC_NZ][HMPC_NT], half[HMPC_NZ], diagonal[HMPC_NZ], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];
-  hmpc_real h[HMPC_NT][HMPC_NT], gram[HMPC_NT][HMPC_NT];
+  hmpc_real a[HMPC_NZ + HMPC_NY][HMPC_NT], half[HMPC_NZ + HMPC_NY], diagonal[HMPC_NZ + HMPC_NY], along[HMPC_NT][HMPC_NT], turned[HMPC_NY][HMPC_NT];
+  hmpc_real h[HMPC_NT][HMPC_NT], gram[HMPC_NT][HMPC_NT], bend[HMPC_NT][HMPC_NT];
   hmpc_real bound[HMPC_TARGET_ROWS][HMPC_NT], end[HMPC_TARGET_ROWS], seen[HMPC_TARGET_ROWS][HMPC_NT], answer;
 } hmpc_search;
 #endif

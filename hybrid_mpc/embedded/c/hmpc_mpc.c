@@ -21,6 +21,7 @@ static void disturb_state(const real *d, real *z_next) {
 
 void hmpc_clear(hmpc_state *s) {
   memset(s, 0, sizeof *s);
+  s->steady.age = HMPC_TARGET_WAIT;
   for (int i = 0; i < HMPC_NU; ++i) s->u[i] = hmpc_clip(u_rest[i], u_min[i], u_max[i]);
   memcpy(s->x, x_rest, sizeof s->x);
   memcpy(s->w, w_rest, sizeof s->w);
@@ -51,6 +52,7 @@ void hmpc_run_free(hmpc_state *s, const real *u, int rows) {
   plan->excess = R(NAN);
   memset(plan->given_way, 0, sizeof plan->given_way);
   s->steady.steady = 0;
+  s->steady.age = HMPC_TARGET_WAIT;
   s->prepared = 0;
   s->pending = 0;
 }

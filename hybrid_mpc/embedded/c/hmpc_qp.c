@@ -291,6 +291,14 @@ static void primal(const hmpc_qp *qp, const hmpc_working *w, const real *start, 
   for (int i = 0; i < HMPC_NV; ++i) s[i] = hmpc_dot(qp->inverse[i] + i, y + i, HMPC_NV - i);
 }
 
+#if HMPC_SOFT > 0
+/* Violation up to which a soft row counts as kept: a distance of the unknowns, but at least rounding errors. */
+static real kept(const real *slope, int kind, real end, real within) {
+  const real norm = hmpc_sqrt(hmpc_dot(slope, slope, HMPC_NV)) / soft_scale[kind];
+  return within * hmpc_clip(norm, HMPC_LEAST_SHARE, R(1.0)) + HMPC_ROUNDING * hmpc_abs(end);
+}
+#endif
+
 /* The bound with the largest violation, or -1. */
 static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_working *w, const real *s, real *by) {
   unsigned char inside[SOFT_LOWER + HMPC_DIM(HMPC_SOFT)] = {0};
@@ -301,7 +309,8 @@ static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_workin
     largest = hmpc_max(largest, w->multiplier[k]);
   }
   /* rounding errors increase with the multipliers */
-  *by = hmpc_min(HMPC_VIOLATED * R(1e-3) * largest, R(0.1) * HMPC_KEPT);
+  const real within = hmpc_min(HMPC_VIOLATED * R(1e-3) * largest, R(0.1) * HMPC_KEPT);
+  *by = within;
   for (int i = 0; i < HMPC_NV; ++i) {
     const real before = i >= HMPC_NU ? s[i - HMPC_NU] : R(0.0);
     const real over[4] = {s[i] - qp->upper[i], qp->lower[i] - s[i], (s[i] - before) - qp->change_upper[i],
@@ -314,20 +323,18 @@ static int worst(const hmpc_qp *qp, const hmpc_linear *linear, const hmpc_workin
       }
   }
 #if HMPC_SOFT > 0
+  if (found < 0) *by = R(0.0);
   for (int row = 0; row < HMPC_SOFT; ++row) {
     int kind;
-    if (!holds(row)) continue;
     const real *const slope = soft_row(qp, linear, row, &kind);
-    const real value = qp->value[row] + hmpc_dot(slope, s, HMPC_NV);
-    const real above = (value - soft_upper[kind]) / soft_scale[kind];
-    const real below = (soft_lower[kind] - value) / soft_scale[kind];
-    if (above > *by && !inside[SOFT_UPPER + row]) {
-      *by = above;
-      found = SOFT_UPPER + row;
-    }
-    if (below > *by && !inside[SOFT_LOWER + row]) {
-      *by = below;
-      found = SOFT_LOWER + row;
+    const real moved = hmpc_dot(slope, s, HMPC_NV) / soft_scale[kind];
+    for (int side = 0; side < 2; ++side) {
+      const int id = (side ? SOFT_LOWER : SOFT_UPPER) + row;
+      const real end = limit(qp, id), over = (side ? -moved : moved) - end;
+      if (over > *by && !inside[id] && over > kept(slope, kind, end, within)) {
+        *by = over;
+        found = id;
+      }
     }
   }
 #else

@@ -23,7 +23,11 @@ enum {
   NT = HMPC_NT,
   HALVINGS = 10, /* of a step that does not reduce the merit */
   SWEEPS = 30,   /* of Jacobi rotations */
-  ROUNDS = 10 * HMPC_TARGET_ROWS
+  ROUNDS = 10 * HMPC_TARGET_ROWS,
+  ROWS = HMPC_NZ + HMPC_NY,
+  PLAIN = 0, /* second derivatives in a step: none, */
+  CURVED,    /* of the deviation: where a set-point beyond reach is closest, an output may turn, */
+  LEANING    /* of the distance from the operating point, at the set-point */
 };
 
 /* Residual, outputs and derivatives at v. */
@@ -134,14 +138,14 @@ static void settle(hmpc_state *s, const real *v, const real *goal, const real *w
 
 /* Householder factors of work->a with row exchanges, the largest row first: a = (l, 0) q'. l has as many columns as the
    rank and is stored in work->a before each row's reflector; order: original number of each row. */
-static int factorize(hmpc_search *work, int *order) {
+static int factorize(hmpc_search *work, int rows, int *order) {
   real first = R(0.0);
   int rank = 0;
-  for (int i = 0; i < HMPC_NZ; ++i) order[i] = i;
-  for (int k = 0; k < HMPC_NZ; ++k, ++rank) {
+  for (int i = 0; i < rows; ++i) order[i] = i;
+  for (int k = 0; k < rows && k < NT; ++k, ++rank) {
     int best = k;
     real largest = R(-1.0);
-    for (int i = k; i < HMPC_NZ; ++i) {
+    for (int i = k; i < rows; ++i) {
       const real size = hmpc_dot(work->a[i] + k, work->a[i] + k, NT - k);
       if (size > largest) {
         largest = size;
@@ -165,7 +169,7 @@ static int factorize(hmpc_search *work, int *order) {
     v[k] -= diagonal; /* the reflector 1 - v v' / half, with |v[k]| of at least size */
     work->half[k] = R(0.5) * hmpc_dot(v + k, v + k, NT - k);
     work->diagonal[k] = diagonal;
-    for (int i = k + 1; i < HMPC_NZ; ++i)
+    for (int i = k + 1; i < rows; ++i)
       hmpc_add(work->a[i] + k, -hmpc_dot(v + k, work->a[i] + k, NT - k) / work->half[k], v + k, NT - k);
   }
   return rank;
@@ -338,22 +342,156 @@ static int least_squares(hmpc_search *work, int m, const real *g, int count, rea
   return 1;
 }
 
-/* Gauss-Newton step at work->at; 0 if its QP has no solution. */
-static int newton(hmpc_search *work, const real *goal, int bounded, real *step) {
+/* Scaled Jacobian of the steady-state equations at work->at, in work->a. */
+static void slopes_of_rest(hmpc_search *work) {
   const hmpc_point *const at = &work->at;
-  const real *const u = at->v + HMPC_NZ;
-  real onto[NT], sees[HMPC_NY][NT] = {{R(0.0)}}, error[HMPC_NY], g[NT], row[NT], eta[NT];
-  real trace = R(0.0), size = R(1e-30);
-  int order[HMPC_NZ], tracked = 0, count = 0;
   for (int i = 0; i < HMPC_NZ; ++i) {
     for (int j = 0; j < HMPC_NZ; ++j)
       work->a[i][j] = (at->slope[i][j] - (i == j ? R(1.0) : R(0.0))) * target_scale[j] / target_heed[i];
     for (int j = 0; j < HMPC_NU; ++j)
       work->a[i][HMPC_NZ + j] = at->slope[i][HMPC_LZ + j] * target_scale[HMPC_NZ + j] / target_heed[i];
+  }
+}
+
+/* Scaled derivative of output i by the unknown j. */
+static real slope_of_output(const hmpc_point *p, int i, int j) {
+  (void)p;
+  if (j < HMPC_NX) return OUTPUT_X(p)[i][j] * target_scale[j];
+  return j < HMPC_NZ ? R(0.0) : OUTPUT_U(p)[i][j - HMPC_NZ] * target_scale[j];
+}
+
+/* Whether the unknown j is at a bound, where it has a multiplier of its own. */
+static int at_bound(const hmpc_point *p, int j) {
+  const real near = HMPC_TARGET_NEAR * target_scale[j];
+  if (j >= HMPC_NX && j < HMPC_NZ) return 0;
+  const real low = j < HMPC_NX ? target_x_range[j][0] : u_min[j - HMPC_NZ];
+  const real high = j < HMPC_NX ? target_x_range[j][1] : u_max[j - HMPC_NZ];
+  return !(p->v[j] - low > near && high - p->v[j] > near);
+}
+
+/* Multipliers at work->at: of the equations and, if leaning, of the weighted outputs, so that the slope of the distance
+   from the operating point vanishes; else of the equations, so that the slope of the outputs' deviation vanishes. */
+static void multipliers(hmpc_search *work, const real *goal, int leaning, real *to) {
+  const hmpc_point *const at = &work->at;
+  real b[NT] = {R(0.0)};
+  int order[ROWS], rows = HMPC_NZ;
+  slopes_of_rest(work);
+  memset(to, 0, sizeof(real) * ROWS);
+  for (int i = 0; i < HMPC_NY; ++i)
+    if (q_y[i] > R(0.0)) {
+      to[rows] = leaning ? R(0.0) : target_root[i] * (at->y[i] - goal[i]);
+      for (int j = 0; j < NT; ++j) work->a[rows][j] = target_root[i] * slope_of_output(at, i, j);
+      ++rows;
+    }
+  for (int j = 0; j < NT; ++j) {
+    const int held = at_bound(at, j);
+    for (int i = 0; i < rows && held; ++i) work->a[i][j] = R(0.0);
+    for (int i = HMPC_NZ; i < rows; ++i) b[j] -= to[i] * work->a[i][j];
+    if (leaning && !held && j >= HMPC_NZ) b[j] = (u_rest[j - HMPC_NZ] - at->v[j]) / target_scale[j];
+  }
+  const int rank = factorize(work, leaning ? rows : HMPC_NZ, order);
+  for (int k = 0; k < rank; ++k)
+    hmpc_add(b + k, -hmpc_dot(work->a[k] + k, b + k, NT - k) / work->half[k], work->a[k] + k, NT - k);
+  for (int i = rank - 1; i >= 0; --i) {
+    real value = b[i];
+    for (int j = i + 1; j < rank; ++j) value -= work->a[j][i] * to[order[j]];
+    to[order[i]] = value / work->diagonal[i];
+  }
+}
+
+/* Second derivatives of the Lagrangian with the multipliers pull along the m directions work->along, in work->bend, and
+   their product with the step onto the steady states, by differences of Jacobians. */
+static void bend(hmpc_state *s, const real *goal, const real *w, const real *pull, int m, const real *onto,
+                 real *turned) {
+  hmpc_search *const work = &s->search;
+  const hmpc_point *const at = &work->at, *const aside = &work->settled;
+  const real far = hmpc_sqrt(hmpc_dot(onto, onto, NT)) + R(1e-30);
+  for (int k = 0; k <= m; ++k) {
+    real v[NT], change[NT];
+    for (int j = 0; j < NT; ++j)
+      v[j] = at->v[j] + HMPC_TARGET_ASIDE * (k < m ? work->along[k][j] : onto[j] / far) * target_scale[j];
+    look(s, v, goal, w, &work->settled);
+    for (int j = 0; j < NT; ++j) {
+      const int column = j < HMPC_NZ ? j : HMPC_LZ + j - HMPC_NZ;
+      int row = HMPC_NZ;
+      change[j] = R(0.0);
+      for (int i = 0; i < HMPC_NZ; ++i)
+        change[j] += pull[i] * (aside->slope[i][column] - at->slope[i][column]) * target_scale[j] / target_heed[i];
+      for (int i = 0; i < HMPC_NY; ++i)
+        if (q_y[i] > R(0.0))
+          change[j] += pull[row++] * target_root[i] * (slope_of_output(aside, i, j) - slope_of_output(at, i, j));
+      change[j] /= HMPC_TARGET_ASIDE;
+    }
+    for (int l = 0; l < m; ++l) {
+      if (k < m) work->bend[k][l] = hmpc_dot(work->along[l], change, NT);
+      if (k == m) turned[l] = far * hmpc_dot(work->along[l], change, NT);
+    }
+  }
+  for (int k = 0; k < m; ++k)
+    for (int l = 0; l < k; ++l) work->bend[k][l] = work->bend[l][k] = R(0.5) * (work->bend[k][l] + work->bend[l][k]);
+}
+
+/* Norm of the first m rows of work->bend. */
+static real bend_norm(const hmpc_search *work, int m) {
+  real sum = R(0.0);
+  for (int k = 0; k < m; ++k) sum += hmpc_dot(work->bend[k], work->bend[k], m);
+  return hmpc_sqrt(sum);
+}
+
+/* Whether the first m rows of work->h are positive definite. */
+static int definite(hmpc_search *work, int m) {
+  for (int i = 0; i < m; ++i)
+    for (int j = 0; j <= i; ++j) {
+      const real rest = work->h[i][j] - hmpc_dot(work->gram[i], work->gram[j], j);
+      if (i == j && !(rest > R(0.0))) return 0;
+      work->gram[i][j] = i == j ? hmpc_sqrt(rest) : rest / work->gram[j][j];
+    }
+  return 1;
+}
+
+/* Adds factor times work->bend to work->h, and more until that is positive definite: first against leaving bounds. */
+static void add_bend(hmpc_search *work, int m, real factor) {
+  const real norm = factor * bend_norm(work, m);
+  real row[NT];
+  for (int k = 0; k < m; ++k) hmpc_add(work->h[k], factor, work->bend[k], m);
+  const int convex = definite(work, m);
+  for (int j = 0; j < NT && !convex; ++j) {
+    if (!at_bound(&work->at, j)) continue;
+    for (int k = 0; k < m; ++k) row[k] = work->along[k][j];
+    const real length = hmpc_dot(row, row, m);
+    for (int k = 0; k < m && length > R(0.0); ++k)
+      hmpc_add(work->h[k], HMPC_TARGET_STIFF * norm * row[k] / length, row, m);
+  }
+  const int enough = convex || definite(work, m);
+  for (int k = 0; k < m && !enough; ++k) work->h[k][k] += R(2.0) * norm;
+}
+
+/* Removes the directions that the outputs determine from a row. */
+static void unseen(const hmpc_search *work, int m, int tracked, real size, real *row) {
+  for (int i = 0; i < tracked; ++i) { /* orthogonal */
+    const real *const seen = work->turned[i];
+    const real length = hmpc_dot(seen, seen, m);
+    if (hmpc_sqrt(length) > HMPC_TARGET_RANK * size) hmpc_add(row, -hmpc_dot(row, seen, m) / length, seen, m);
+  }
+}
+
+/* Gauss-Newton step at work->at; 0 if its QP has no solution. mode: which second derivatives along the steady states it
+   has. */
+static int newton(hmpc_state *s, const real *goal, const real *w, int bounded, int mode, real *step) {
+  hmpc_search *const work = &s->search;
+  const hmpc_point *const at = &work->at;
+  const real *const u = at->v + HMPC_NZ;
+  real pull[ROWS], turned[NT] = {R(0.0)};
+  real onto[NT], sees[HMPC_NY][NT] = {{R(0.0)}}, error[HMPC_NY], g[NT], row[NT], eta[NT];
+  real trace = R(0.0), size = R(1e-30);
+  int order[HMPC_NZ], tracked = 0, count = 0;
+  if (mode != PLAIN) multipliers(work, goal, mode == LEANING, pull);
+  slopes_of_rest(work);
+  for (int i = 0; i < HMPC_NZ; ++i) {
     if (!hmpc_all_finite(work->a[i], NT) || !hmpc_finite(at->rest[i])) return 0;
     row[i] = -at->rest[i] / target_heed[i];
   }
-  const int rank = factorize(work, order), m = NT - rank;
+  const int rank = factorize(work, HMPC_NZ, order), m = NT - rank;
   shortest(work, rank, order, row, onto); /* step onto the steady states */
   for (int k = 0; k < m; ++k) {           /* directions along them */
     memset(work->along[k], 0, sizeof work->along[k]);
@@ -362,9 +500,7 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
   }
   for (int i = 0; i < HMPC_NY; ++i) {
     if (!(q_y[i] > R(0.0))) continue;
-    for (int j = 0; j < NT; ++j) row[j] = R(0.0);
-    for (int j = 0; j < HMPC_NX; ++j) row[j] = OUTPUT_X(at)[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) row[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
+    for (int j = 0; j < NT; ++j) row[j] = slope_of_output(at, i, j);
     for (int k = 0; k < m; ++k) sees[tracked][k] = target_root[i] * hmpc_dot(row, work->along[k], NT);
     error[tracked] = target_root[i] * (goal[i] - at->y[i] - hmpc_dot(row, onto, NT));
     ++tracked;
@@ -378,26 +514,41 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
       work->answer += sees[i][k] * hmpc_dot(target_slopes[i], work->along[k] + HMPC_NZ, HMPC_NU);
   memset(work->h, 0, sizeof work->h);
   memset(g, 0, sizeof g);
+  if (mode != PLAIN) bend(s, goal, w, pull, m, onto, turned);
+  const real whole = mode == CURVED ? hmpc_sqrt(size * size + bend_norm(work, m)) : size;
+  const real factor = R(1.0) / whole / whole;
   for (int i = 0; i < tracked; ++i) {
-    const real factor = R(1.0) / size / size;
     for (int k = 0; k < m; ++k) {
       g[k] -= sees[i][k] * error[i] * factor;
       hmpc_add(work->h[k], sees[i][k] * factor, sees[i], m);
     }
   }
+  if (mode == CURVED) {
+    for (int k = 0; k < m; ++k) g[k] += turned[k] * factor;
+    add_bend(work, m, factor);
+  }
   for (int j = 0; j < HMPC_NU; ++j) { /* directions that the outputs do not determine: towards u_rest */
     const real far = (u_rest[j] - u[j]) / target_scale[HMPC_NZ + j] - onto[HMPC_NZ + j];
     for (int k = 0; k < m; ++k) row[k] = work->along[k][HMPC_NZ + j];
-    memcpy(eta, row, sizeof eta);
-    for (int i = 0; i < tracked; ++i) {
-      const real *const seen = work->turned[i];
-      const real length = hmpc_dot(seen, seen, m);
-      if (hmpc_sqrt(length) > HMPC_TARGET_RANK * size) hmpc_add(row, -hmpc_dot(eta, seen, m) / length, seen, m);
-    }
+    unseen(work, m, tracked, size, row);
     for (int k = 0; k < m; ++k) {
       g[k] -= HMPC_TARGET_FREE * row[k] * far;
       hmpc_add(work->h[k], HMPC_TARGET_FREE * row[k], row, m);
     }
+  }
+  if (mode == LEANING) {
+    for (int side = 0; side < 2; ++side) /* both sides of a symmetric matrix */
+      for (int k = 0; k < m; ++k) {
+        unseen(work, m, tracked, size, work->bend[k]);
+        for (int l = 0; l < k; ++l) {
+          const real kept = work->bend[k][l];
+          work->bend[k][l] = work->bend[l][k];
+          work->bend[l][k] = kept;
+        }
+      }
+    unseen(work, m, tracked, size, turned);
+    for (int k = 0; k < m; ++k) g[k] += HMPC_TARGET_FREE * turned[k];
+    add_bend(work, m, HMPC_TARGET_FREE);
   }
   for (int k = 0; k < m; ++k) trace += work->h[k][k];
   for (int k = 0; k < m; ++k) work->h[k][k] += HMPC_TARGET_DAMPING * trace + R(0.01) * HMPC_TARGET_DAMPING;
@@ -414,9 +565,8 @@ static int newton(hmpc_search *work, const real *goal, int bounded, real *step) 
     if (!bounds(work, m, row, at->v[j] / scale + onto[j], range[0] / scale, range[1] / scale, &count)) return 0;
   }
   for (int i = 0; i < HMPC_NY && bounded; ++i) {
-    real slope[NT] = {R(0.0)};
-    for (int j = 0; j < HMPC_NX; ++j) slope[j] = OUTPUT_X(at)[i][j] * target_scale[j];
-    for (int j = 0; j < HMPC_NU; ++j) slope[HMPC_NZ + j] = OUTPUT_U(at)[i][j] * target_scale[HMPC_NZ + j];
+    real slope[NT];
+    for (int j = 0; j < NT; ++j) slope[j] = slope_of_output(at, i, j);
     for (int k = 0; k < m; ++k) row[k] = hmpc_dot(slope, work->along[k], NT);
     const real now = at->y[i] + hmpc_dot(slope, onto, NT);
     if (!bounds(work, m, row, now, target_y_range[i][0], target_y_range[i][1], &count)) return 0;
@@ -434,26 +584,48 @@ static void place(const hmpc_steady *from, real *v) {
   memcpy(v + HMPC_NZ, from->u, sizeof from->u);
 }
 
-/* Gauss-Newton method from v; bounded: within the bounds of states and outputs. */
-static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, hmpc_descent *found) {
+/* Gauss-Newton method from v; bounded: within the bounds of states and outputs; firm: ends as soon as its end is not
+   sure. Second derivatives of the deviation are used from the start (CURVED) or once a whole step fails, those of the
+   distance from the operating
+   point once steps at the set-point do not contract. */
+static void descend(hmpc_state *s, const real *v, const real *goal, const real *w, int bounded, int firm,
+                    int mode, hmpc_descent *found) {
   hmpc_search *const work = &s->search;
   hmpc_point *const at = &work->at, *const after = &work->after;
   real step[NT], there[NT], before = HMPC_HUGE, off = R(0.0), apart = R(0.0);
   real lacks[HMPC_TARGET_ITERATIONS + 1], offs[HMPC_TARGET_ITERATIONS + 1];
   real weight = HMPC_TARGET_LEAST_WEIGHT;
-  int done = 0, sure = 1;
+  int done = 0, sure = 1, near = 0, tracked = 0, n = 0;
+  for (int i = 0; i < HMPC_NY; ++i) tracked += q_y[i] > R(0.0);
   look(s, v, goal, w, at);
   lacks[0] = at->lacks;
   offs[0] = at->off;
   for (int k = 1; k <= HMPC_TARGET_ITERATIONS; ++k) {
     real size = R(0.0), share = R(1.0), from;
-    if (!newton(work, goal, bounded, step)) break;
+    if ((firm && !sure) || !newton(s, goal, w, bounded, mode, step)) break;
     for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs(step[i] / target_scale[i]));
     if (size <= HMPC_TARGET_STEADY) {
       done = at->lacks <= HMPC_TARGET_STILL;
       break;
     }
-    if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * before)) sure = 0;
+    const int spare = HMPC_NU > tracked && mode != LEANING && at->lacks <= HMPC_TARGET_STILL &&
+                      at->off <= HMPC_TARGET_REACHED; /* inputs that set-points do not determine */
+    if (spare && size > HMPC_TARGET_CONTRACTS * before) {
+      mode = LEANING; /* the same point again */
+      near = size < HMPC_TARGET_NEAR;
+      work->good = *at;
+      before = HMPC_HUGE;
+      continue;
+    }
+    if (mode == LEANING) {
+      if (!(size <= HMPC_TARGET_CONTRACTS * before)) break;
+      before = size;
+      for (int i = 0; i < NT; ++i) there[i] = at->v[i] + step[i];
+      settle(s, there, goal, w, after);
+      *at = *after;
+      continue;
+    }
+    const real last = before;
     before = size;
     /* exact penalty: the step must reduce the merit to first order */
     if (at->lacks > HMPC_TARGET_STILL)
@@ -467,7 +639,7 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       real second[NT], again = R(0.0);
       work->kept = *at;
       *at = *after;
-      if (newton(work, goal, bounded, second)) {
+      if (newton(s, goal, w, bounded, mode, second)) {
         for (int i = 0; i < NT; ++i) again = hmpc_max(again, hmpc_abs(second[i] / target_scale[i]));
         for (int i = 0; i < NT; ++i) there[i] = at->v[i] + second[i];
         settle(s, there, goal, w, after);
@@ -479,27 +651,45 @@ static void descend(hmpc_state *s, const real *v, const real *goal, const real *
       *at = work->kept;
       work->answer = answer;
     }
-    for (int half = 0; half < HALVINGS && !(merit(after, weight) < from); ++half) {
+    if (!(merit(after, weight) < from) && !(size < HMPC_TARGET_NEAR) && at->off > HMPC_TARGET_REACHED && mode == PLAIN) {
+      mode = CURVED; /* the same point again */
+      before = last;
+      continue;
+    }
+    if (!(size < HMPC_TARGET_NEAR || size <= HMPC_TARGET_CONTRACTS * last)) sure = 0;
+    /* where an output turns, the merit is flat, and rounding hides what the last steps gain */
+    const int flat = mode == CURVED && size < HMPC_TARGET_NEAR && size <= HMPC_TARGET_CONTRACTS * last;
+    for (int half = 0; half < HALVINGS && !flat && !(merit(after, weight) < from); ++half) {
       share *= R(0.5);
       for (int i = 0; i < NT; ++i) there[i] = at->v[i] + share * step[i];
       settle(s, there, goal, w, after);
       if (!(size < HMPC_TARGET_NEAR)) sure = 0;
     }
-    if (!(merit(after, weight) < from)) { /* only rounding errors remain, or there is no progress */
-      done = size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
-      break;
+    if (!flat && !(merit(after, weight) < from)) { /* only rounding errors remain, or there is no progress */
+      done = !spare && size < HMPC_TARGET_NEAR && at->lacks <= HMPC_TARGET_STILL;
+      if (!spare) break;
+      mode = LEANING;
+      near = size < HMPC_TARGET_NEAR;
+      work->good = *at;
+      before = HMPC_HUGE;
+      continue;
     }
     *at = *after;
-    lacks[k] = at->lacks;
-    offs[k] = at->off;
+    lacks[++n] = at->lacks;
+    offs[n] = at->off;
     size = R(0.0);
     for (int i = 0; i < NT; ++i) size = hmpc_max(size, hmpc_abs((at->v[i] - v[i]) / target_scale[i]));
     if (size > HMPC_TARGET_AWAY) break;
-    if (k < HMPC_TARGET_WITHIN) continue;
-    if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[k - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL) &&
+    if (n < HMPC_TARGET_WITHIN) continue;
+    if (at->lacks > hmpc_max(HMPC_TARGET_STALLED * lacks[n - HMPC_TARGET_WITHIN], HMPC_TARGET_STILL) &&
         merit(at, weight) >
-            HMPC_TARGET_CREEPS * (weight * lacks[k - HMPC_TARGET_WITHIN] + offs[k - HMPC_TARGET_WITHIN]))
+            HMPC_TARGET_CREEPS * (weight * lacks[n - HMPC_TARGET_WITHIN] + offs[n - HMPC_TARGET_WITHIN]))
       break;
+  }
+  if (mode == LEANING && !done) { /* the set-point is reached, farther from the operating point */
+    *at = work->good;
+    done = 1;
+    sure = sure && near;
   }
   for (int i = 0; i < HMPC_NY; ++i)
     if (q_y[i] > R(0.0)) off = hmpc_max(off, target_root[i] * hmpc_abs(at->y[i] - goal[i]));
@@ -544,7 +734,7 @@ static int follow(hmpc_state *s, const real *v, const real *y, const real *w, in
     for (int j = 0; j < HMPC_ND && !v; ++j) work->d[j] = to * s->d[j];
     for (int j = 0; j < HMPC_NW && !v; ++j) work->w[j] = w_rest[j] + to * (w[j] - w_rest[j]);
     for (int i = 0; i < HMPC_NY; ++i) towards[i] = begun[i] + to * (y[i] - begun[i]);
-    descend(s, at, towards, work->w, 1, found);
+    descend(s, at, towards, work->w, 1, sure, PLAIN, found);
     if (found->at.steady && (found->sure || !sure)) {
       arrived = to >= R(1.0);
       memcpy(at, found->v, sizeof at);
@@ -575,53 +765,74 @@ static int best(const hmpc_search *work, int n) {
   return chosen;
 }
 
-/* Steady state for outputs y; weighted outputs are finite. The search has the order of Targets.at in Python. If no
-   steady state keeps the bounds of states and outputs, it is searched without them. */
-void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
-                       hmpc_steady *found) {
+/* The search of hmpc_steady_state; recent: start is the result of a search for the same set-point, and not long ago it
+   was searched from several starts. Returns whether it was now. */
+static int search(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
+                  int recent, hmpc_steady *found) {
   hmpc_search *const work = &s->search;
   hmpc_descent trial;
   const int known = start && start->steady ? 1 : 0;
   real first[NT];
-  int n = 0;
+  int n = 0, turns = 0;
+  /* an input within its limits beyond reach of the set-point: there an output turns */
+  for (int j = 0; j < HMPC_NU && known; ++j) {
+    const real near = HMPC_TARGET_NEAR * target_scale[HMPC_NZ + j];
+    turns |= !start->reached && start->u[j] > u_min[j] + near && start->u[j] < u_max[j] - near;
+  }
+  wide = wide && (known || !recent);
   memcpy(work->d, s->d, sizeof(real) * HMPC_ND);
   memcpy(first, target_starts[0], sizeof first);
   if (known) place(start, first);
   if (known || !wide) {
-    descend(s, first, y, w, 1, &work->tried[0]);
+    descend(s, first, y, w, 1, 0, turns ? CURVED : PLAIN, &work->tried[0]);
     n = 1;
     if (work->tried[0].lost && known) {
-      descend(s, target_starts[0], y, w, 1, &trial);
+      descend(s, target_starts[0], y, w, 1, 0, PLAIN, &trial);
       if (trial.at.steady && trial.off < work->tried[0].off) work->tried[0] = trial;
     }
     *found = work->tried[0].at;
-    if (work->tried[0].sure || (found->steady && !wide)) return;
+    if (work->tried[0].sure || (found->steady && (recent || !wide))) return 0;
   }
   if (wide) {
     for (int own = 0; own <= known; ++own) {
       if (!follow(s, own ? first : NULL, y, w, 1, &work->tried[n])) continue;
       if (!work->tried[n].lost) {
         *found = work->tried[n].at;
-        return;
+        return wide;
       }
       ++n;
     }
-    for (int k = 0; k < HMPC_TARGET_STARTS; ++k) descend(s, target_starts[k], y, w, 1, &work->tried[n++]);
+    for (int k = 0; k < HMPC_TARGET_STARTS; ++k) descend(s, target_starts[k], y, w, 1, 0, PLAIN, &work->tried[n++]);
     const int chosen = best(work, n);
     if (chosen >= 0 || follow(s, known ? first : NULL, y, w, 0, &trial)) {
       *found = chosen >= 0 ? work->tried[chosen].at : trial.at;
-      return;
+      return wide;
     }
   }
   *found = work->tried[0].at;
   for (int k = 0; k <= (wide && known); ++k) {
-    descend(s, k ? target_starts[0] : first, y, w, 0, &trial);
+    descend(s, k ? target_starts[0] : first, y, w, 0, 0, PLAIN, &trial);
     if (trial.at.steady) {
       *found = trial.at;
-      return;
+      return wide;
     }
   }
+  return wide;
 }
+
+/* Steady state for outputs y; weighted outputs are finite. The search has the order of Targets.at in Python. If no
+   steady state keeps the bounds of states and outputs, it is searched without them. */
+void hmpc_steady_state(hmpc_state *s, const hmpc_real *y, const hmpc_real *w, const hmpc_steady *start, int wide,
+                       hmpc_steady *found) {
+  int again = start != NULL, age = HMPC_TARGET_WAIT;
+  for (int i = 0; i < HMPC_NY && again; ++i)
+    if (q_y[i] > R(0.0)) again = y[i] <= start->goal[i] && y[i] >= start->goal[i];
+  if (again && start->age + 1 < age) age = start->age + 1;
+  if (search(s, y, w, start, wide, age < HMPC_TARGET_WAIT, found)) age = 0;
+  memcpy(found->goal, y, sizeof found->goal);
+  found->age = age;
+}
+
 
 static void set_target(hmpc_target *to, int k, const real *x, const real *u, const real *y) {
   memcpy(to->x[k], x, sizeof to->x[k]);
