@@ -111,8 +111,8 @@ def predict(kit: Kit, trajectory: Trajectory, model: str = "") -> Prediction:
     networks' hidden state; they are not predicted. Free runs are as long as those that evaluated the model in its run
     (``free_run`` of the artifact's data specification). Each starts at the end of the one before, with its own warm-up.
     The band of the free run was calibrated on validation runs (docs/predict.md). Beyond the longest of these runs, the
-    band grows further without calibration. One-step predictions are those of ``kit.observer(model, input_noise=0)``;
-    their band comes from the observer's covariance.
+    band grows further without calibration. One-step predictions are those of ``kit.observer(model)``; their band comes
+    from the observer's covariance.
 
     Args:
         kit: A loaded artifact.
@@ -249,7 +249,7 @@ def _free_run(model: HybridModel, whole: Trajectory, x: Array, lost: int, warm: 
 
 def _one_step(kit: Kit, name: str, recording: Trajectory) -> tuple[Array, Array]:
     """One-step predictions of each sample, and half widths of their band, both ``(n, n_y)``."""
-    observer, model = kit.observer(name, input_noise=0.0), kit.models[name]
+    observer, model = kit.observer(name), kit.models[name]
     n, n_y = recording.y.shape
     hat, variance = np.full((2, n, n_y), np.nan)
     for k in range(n):

@@ -22,7 +22,6 @@ from hybrid_mpc.estimate.switching import Filter
 from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter, tracked_range, with_tracked
 from hybrid_mpc.files import digest, sha256
 from hybrid_mpc.kit.assembly import (
-    INPUT_NOISE,
     make_adaptive_guard,
     make_controller,
     make_estimator,
@@ -489,7 +488,7 @@ class Kit:
 
     def observer(
         self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching",
-        input_noise: float = INPUT_NOISE,
+        input_noise: float = 0.0,
     ) -> Filter:  # fmt: skip
         """The estimator of a model's state, hidden state and, with ``load``, unknown disturbances.
 
@@ -498,8 +497,8 @@ class Kit:
             task: Task whose control problem determines the size of a load. Default: the common control problem.
             load: Whether it estimates a load; without this, a constant load causes an offset. Default: True.
             kind: ``"switching"``, ``"ekf"``, ``"ukf"`` or ``"mhe"`` (docs/observers.md). Default: switching.
-            input_noise: Noise that the filter assumes at the inputs, as a share of their ranges: more makes a loop
-                robust, less makes predictions exact. Default: 0.05; 0 without ``load``.
+            input_noise: Noise that the filter assumes at the inputs, as a share of their ranges, with which a loop
+                bears larger errors of the model (docs/disturbances.md#the-observer). Default: 0.
 
         Raises:
             InputError: If model, task or kind are unknown, or control problem or noise are missing.

@@ -50,13 +50,6 @@ with a plan of seconds."""
 JUMP = 0.05
 """Standard deviation of a jump of the load per period in the jump filter, as a share of the load's size: a load of 5 %
 is ordinary, a larger one takes a few periods. It is larger if slips would explain it, see :func:`jump_shares`."""
-INPUT_NOISE = 0.05
-"""Standard deviation per period of a noise at the inputs in the quiet filter, as a share of their ranges: errors of the
-model as large as an ordinary load, new in each period. A filter without it trusts the model too much: the margins of
-the controller's state feedback are lost in its loop, and come back with noise at the inputs (loop transfer recovery:
-Doyle and Stein, *Robustness with observers*, IEEE TAC 24, 1979). Loops on plants whose parameters are 20 % off cost 0.7
-to 1.0 of those without it; with 0.1 the encoder of the golf robot moves the input a third more
-(docs/results/unknown_machines.md)."""
 FIRST_LOAD = 0.001
 """Initial standard deviation of the load, as a share of the input's range. It is small, because the load of a machine
 that sticks at rest is not observable, and its estimate would be wrong when the machine moves."""
@@ -198,7 +191,7 @@ def tuned_noise(
         return np.where(np.isnan(own), np.minimum(scale * base, most), own)
 
     def filter_of(scale: float) -> Filter:
-        return make_estimator(model, scenario, scaled(scale), observer=observer, input_noise=0.0)
+        return make_estimator(model, scenario, scaled(scale), observer=observer)
 
     # factors on the model's one-period errors; the process noise is that of largest likelihood
     return scaled(choose_most_likely(filter_of, parts, (1.0, 3.0)))
@@ -222,7 +215,7 @@ def make_estimator(
     *,
     observer: bool = True,
     kind: str = "switching",
-    input_noise: float = INPUT_NOISE,
+    input_noise: float = 0.0,
 ) -> Filter:
     """Build the estimator of a model.
 
@@ -238,8 +231,10 @@ def make_estimator(
         observer: Whether it estimates the unmeasured disturbances. Default: True.
         kind: Kind of observer (:data:`OBSERVERS`, docs/observers.md). Kinds other than ``switching`` have the noise of
             its quiet filter. Default: switching; without ``observer`` that is the extended Kalman filter.
-        input_noise: Noise at the inputs in the quiet filter, as a share of their ranges; only with ``observer``. More
-            makes loops robust, and inputs move more with the sensors' noise. Default: :data:`INPUT_NOISE`.
+        input_noise: Noise at the inputs in the quiet filter, as a share of their ranges; only with ``observer``. With
+            0.05 to 0.2, loops of unstable or integrating machines bear larger errors of the model, but inputs move more
+            with the sensors' noise, and loads are found later (loop transfer recovery: Doyle and Stein, *Robustness
+            with observers*, IEEE TAC 24, 1979). Default: 0.
 
     Raises:
         InputError: If the kind is unknown, the size of ``sensor_sigma`` or ``first_sigma`` is wrong, there is no

@@ -68,8 +68,7 @@ def estimation_stage(context: Context) -> EstimationResult | Absent:
     arrays: dict[str, Array] = {}
     for i, name in enumerate(OBSERVERS):
         context.progress.update("observers", i, len(OBSERVERS), name)
-        # without the noise at the inputs, which a loop needs and the recordings do not show
-        estimator = kit.observer(CONTROLLERS[name].model, load=CONTROLLERS[name].observer, input_noise=0.0)
+        estimator = kit.observer(CONTROLLERS[name].model, load=CONTROLLERS[name].observer)
         try:
             found[name] = tested = consistency(estimator, parts)
         except InputError as too_short:
