@@ -1345,7 +1345,7 @@ def examine(
     time = step_time([one for one in own if not one.fails] or own, 1e3 * points[0].model.dt)
     of_model = horizon(points), margins(points, _find_prior_points(kit, tasks), lacking_delay)
     of_observer = process_noise(kit), innovations(tested)
-    of_tracking = _examine_tracking(kit, tasks, lacking_delay, report)
+    of_tracking = examine_tracking(kit, tasks, lacking_delay, report)
     if fails is not None:  # with a failing loop, rows about settled loops have no meaning
         return (fails, time, *of_model, *of_observer, *of_tracking)
     elsewhere = loads_elsewhere(kit, points[0])
@@ -1384,13 +1384,27 @@ def _find_trials(points: Sequence[SetPoint], report: Callable[[int, int, str], N
     return every
 
 
-def _examine_tracking(
-    kit: Kit, tasks: Sequence[Task], lacking_delay: float, report: Callable[[int, int, str], None]
+def examine_tracking(
+    kit: Kit,
+    tasks: Sequence[Task],
+    lacking_delay: float = 0.0,
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> tuple[Promise, ...]:
-    """The rows on offset, step time, margins and late inputs, of the loops with tracked parameters; empty without."""
+    """The rows on offset, late inputs, step time and margins, of the loops with tracked parameters; empty without.
+
+    Args:
+        kit: The kit.
+        tasks: The scenario's tasks.
+        lacking_delay: As for :func:`examine`. Default: none.
+        report: As for :func:`examine`. Default: no report.
+    """
     if not kit.loop.tracked:
         return ()
-    points = set_points(kit, tasks, tracking=True)
+    try:
+        points = set_points(kit, tasks, tracking=True)
+    except InputError as error:  # e.g. undetectable disturbances at other values of the parameters
+        remedy = "Track other parameters (docs/tracking.md#decide-yourself)."
+        return (Promise("closed loop, tracking", "not promised", str(error), remedy),)
     every = _find_trials(points, report)
     fails = failing_loop(points, every)
     own = [one for trials in every for one in trials if not one.fails]
