@@ -251,12 +251,13 @@ def choose_tracked(
 
         Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
         """
-        times = np.geomspace(DAY, min(horizon, DAY), TIMES)
-        some = [replace(one, time=float(time)) for time in times]
-        logs = [
-            sum(log_likelihood(TrackingFilter(o, [own]).inner, t) for o, part in sets[-1] for t in part)
-            for own in some
-        ]
+        some = [replace(one, time=float(time)) for time in np.geomspace(DAY, min(horizon, DAY), TIMES)]
+        logs: list[float] = []
+        for own in some:
+            filters = [(TrackingFilter(o, [own]).inner, part) for o, part in sets[-1]]
+            logs.append(sum(log_likelihood(inner, t) for inner, part in filters for t in part))
+            if logs[-1] < max(logs) - WORTH:  # past the maximum
+                break
         best = int(np.argmax(logs))
         return (some[best],) if logs[best] > logs[0] + WORTH else ()
 

@@ -115,7 +115,8 @@ def test_the_user_decides():
     own = {p.name: p for p in found.parameters}
     assert own["gain"].std == 0.0
     assert own["gain"].declared
-    assert own["bias"].tracked() == TrackedParameter("bias", pytest.approx(0.05), time=60.0)
+    assert own["bias"].std == pytest.approx(0.05)
+    assert own["bias"].tracked().time == 60.0
     assert own["tau"].tracked().time == DAY
     assert own["tau"].std > 0
 
@@ -131,7 +132,7 @@ def observer(fit, make=Heater):
 
 def test_predictions_from_the_observer_improve_where_a_parameter_varies():
     fit, found = varying_of(Heater, recorded(GAINS))
-    chosen = choose_tracked([[(observer(fit), recorded(GAINS, seed=5))]], found, 2.0, warm_up=1.0)
+    chosen = choose_tracked([[(observer(fit), recorded(GAINS[:4], seed=5))]], found, 2.0, warm_up=1.0)
     assert chosen.tracked[0].name == "gain"
     assert chosen.tracked[0].time == DAY  # the gain is constant within each recording
     assert chosen.ratio["heat"] < 0.8
