@@ -3,12 +3,13 @@
     python benchmarks/tracked.py --data ../shared/data [--machines temperature_lab ...] [--folds 5] [--declared 0.1]
 
 Recordings are left out in the groups of ``benchmarks/no_harm.py``. In each the prior is fitted to the others, which
-also decide which parameters vary and whether tracking them improves predictions. Then two observers of the fitted
-prior, with the same noise, watch what was left out: one tracks these parameters, one does not. At starts a quarter of a
-horizon apart both predict the horizon under the measured inputs. ``ratio`` is the tracking observer's root mean square
-error over the other's, by output; 1 where nothing is tracked. ``temperature_lab_prbs`` fits to the identification
-recording alone and leaves out the other days. With ``--declared`` the recordings decide nothing: all free parameters
-are declared to vary by this relative standard deviation.
+also decide which parameters vary, whether tracking them improves predictions, and their drift. Then two observers of
+the fitted prior, with the same noise, watch what was left out: one tracks these parameters, one does not. At starts a
+quarter of a horizon apart both predict the horizon under the measured inputs. ``ratio`` is the tracking observer's root
+mean square error over the other's, by output; 1 where nothing is tracked. ``tracked`` has the standard deviation of
+each parameter and the time constant [s] of its drift. ``temperature_lab_prbs`` fits to the identification recording
+alone and leaves out the other days. With ``--declared`` the recordings decide nothing: all free parameters are declared
+to vary by this relative standard deviation.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ def row(
         "machine": name, "fold": fold,
         "untracked": {o: round(float(e), 4) for o, e in zip(outputs, before, strict=True)},
         "ratio": {o: round(float(r), 3) for o, r in zip(outputs, ratio, strict=True)},
-        "tracked": {one.name: round(one.std, 4) for one in tracked}, "seconds": round(seconds, 1),
+        "tracked": {one.name: (round(one.std, 4), round(one.time, 1)) for one in tracked}, "seconds": round(seconds, 1),
     }  # fmt: skip
     print("  ", made, file=sys.stderr, flush=True)
     return made

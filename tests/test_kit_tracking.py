@@ -41,8 +41,10 @@ def test_observer_json_names_the_tracked_parameters(folder, kit):
     assert kit.on(SCENARIO).loop.tracked == TRACKED
 
 
-def test_promises_are_those_of_the_loop_without_tracking(kit):
-    assert kit.with_tracked(()).identity == kit.identity
+def test_promises_depend_on_the_tracked_parameters(kit):
+    assert kit.with_tracked(()).identity != kit.identity
+    assert kit.with_tracked([replace(TRACKED[0], time=3600.0)]).identity != kit.identity
+    assert kit.with_tracked(TRACKED).identity == kit.identity
 
 
 def test_a_kit_without_tracked_parameters_says_so(kit):

@@ -49,17 +49,19 @@ zero into a large negative one."""
 
 @dataclass(frozen=True)
 class MpcGain:
-    """Linearized MPC: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr``.
+    """Linearized MPC: ``du_0 = by_state dz + by_load dd + by_before du_before + by_reference dr + by_measured dw``.
 
     Exact while no bound is active and the linearization of the prediction does not change. ``z = (x, h)`` and the
     unmeasured disturbances ``d`` are estimates. ``u_before`` is the previous input (its gain is zero without
-    ``r_delta``). ``r`` is a reference that is constant over the horizon.
+    ``r_delta``). ``r`` is a reference, and ``w`` measured disturbances, constant over the horizon; only
+    :func:`solved_gain` computes ``by_measured``.
     """
 
     by_state: Array
     by_load: Array
     by_before: Array
     by_reference: Array
+    by_measured: Array | None = None
 
 
 def mpc_gain(
@@ -193,21 +195,23 @@ def solved_gain(
             f"MPC gain: the input {plan.u[0].tolist()} lies on a bound, so its gain is zero. Choose another point"
             " [HM-ANALYZE-024]"
         )
-    steps = DIFFERENCE * np.concatenate(
-        [sizes.states, sizes.hidden, disturbance_sizes(model, ocp), ocp.input_scale, np.ones(row.size)]
-    )
-    edges = np.cumsum([model.n_x, model.n_h, n_d, model.n_u])
+    ranges = np.array([s.upper - s.lower for s in model.disturbances])
+    steps = DIFFERENCE * np.concatenate([
+        sizes.states, sizes.hidden, disturbance_sizes(model, ocp), ocp.input_scale, np.ones(row.size),
+        np.where(np.isfinite(ranges), ranges, np.maximum(np.abs(w0), 1.0)),
+    ])  # fmt: skip
+    edges = np.cumsum([model.n_x, model.n_h, n_d, model.n_u, row.size])
     slopes = []
     for i, step in enumerate(steps):
         ends = []
         for sign in (1.0, -1.0):
             moved = np.zeros(steps.size)
             moved[i] = sign * step
-            dx, dh, dd, du, dr = np.split(moved, edges)
-            estimate = replace(at, x=x0 + dx, h=h0 + dh, d=dd)
+            dx, dh, dd, du, dr, dw = np.split(moved, edges)
+            estimate = replace(at, x=x0 + dx, h=h0 + dh, d=dd, w=w0 + dw)
             ends.append(solved(estimate, u0 + du, row + dr, plan).u[0])
         slopes.append((ends[0] - ends[1]) / (2.0 * step))
-    parts = np.split(np.array(slopes).T, [n_z, n_z + n_d, n_z + n_d + model.n_u], axis=1)
+    parts = np.split(np.array(slopes).T, [n_z, *edges[2:]], axis=1)
     return MpcGain(*parts)
 
 

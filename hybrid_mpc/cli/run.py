@@ -158,14 +158,15 @@ def track_lines(results: Results) -> list[str]:
     if isinstance(found, Absent):
         return []
     units = {p.name: p.unit for p in found.varying.parameters}
-    names = ", ".join(f"{one.name} ({one.words(units[one.name])})" for one in found.tracking.tracked)
+    own = found.tracking
+    names = ", ".join(f"{one.name} ({one.words(units[one.name], own.horizon)})" for one in own.tracked)
     if not names:
         return ["tracked parameters: none, since tracking improves no prediction"]
-    ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in found.tracking.ratio.items())
+    ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in own.ratio.items())
     return [
         f"tracked parameters, with their standard deviations: {names}; ratio of prediction errors with to without "
         f"tracking: {ratios}",
-        *found.tracking.doubts,
+        *own.doubts,
     ]
 
 

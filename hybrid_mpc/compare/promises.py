@@ -23,9 +23,10 @@ from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate, ExtendedKalmanFilter
 from hybrid_mpc.estimate.offset_free import OffsetFree, distinguishable, offset_free, steady_matrices
 from hybrid_mpc.estimate.switching import Filter, SwitchingFilter
+from hybrid_mpc.estimate.tracking import TrackingFilter
 from hybrid_mpc.estimate.tuning import periods_to_find
 from hybrid_mpc.kit.artifact import Kit
-from hybrid_mpc.kit.assembly import SEARCHED, make_controller, make_ocp
+from hybrid_mpc.kit.assembly import SEARCHED, make_ocp
 from hybrid_mpc.kit.disturbances import loads_by_parameters, rates_of_outputs
 from hybrid_mpc.kit.promises import Promise
 from hybrid_mpc.loop.plant import ModelPlant, ModelState
@@ -183,7 +184,7 @@ class SetPoint:
         reference: The set-point ``(columns,)``.
         w: Measured disturbances ``(n_w,)`` at the set-point.
         estimator: The kit's observer.
-        controller: The kit's controller.
+        controller: The kit's controller. If it plans with tracked parameters, the observer tracks them.
     """
 
     model: HybridModel
@@ -191,8 +192,18 @@ class SetPoint:
     tasks: tuple[str, ...]
     reference: Array
     w: Array
-    estimator: Filter
+    estimator: Filter | TrackingFilter
     controller: SafeController
+
+    @property
+    def tracking(self) -> bool:
+        """Whether the observer tracks parameters."""
+        return isinstance(self.estimator, TrackingFilter)
+
+    @property
+    def planned_w(self) -> Array:
+        """:attr:`w` with the fitted values of tracked parameters: the measured disturbances of the controller."""
+        return np.append(self.w, self.estimator.model.w[self.model.n_w :])
 
     @cached_property
     def rest(self) -> tuple[Array, Array]:
@@ -208,7 +219,7 @@ class SetPoint:
         n = m.n_x + m.n_h + m.n_d
         at = Estimate(
             0.0, m.x0, hidden_fixed_point(m, m.x0, m.u0, w=self.w), np.zeros(m.n_d), np.zeros((n, n)), empty,
-            float("nan"), w=self.w,
+            float("nan"), w=self.planned_w,
         )  # fmt: skip
         target = self.controller.controller.problem.target(self.reference[None], None, at)
         x, u = target.x[0], target.u[0]
@@ -384,13 +395,16 @@ def task_end(kit: Kit, task: Task, loop: Mapping[str, Array]) -> TaskEnd | None:
     )
 
 
-def quiet(estimator: Filter) -> ExtendedKalmanFilter:
+def quiet(estimator: Filter | TrackingFilter) -> ExtendedKalmanFilter:
     """The quiet filter of a switching observer, or the observer itself."""
-    return estimator.filters[0] if isinstance(estimator, SwitchingFilter) else estimator
+    own = estimator.inner if isinstance(estimator, TrackingFilter) else estimator
+    return own.filters[0] if isinstance(own, SwitchingFilter) else own
 
 
-def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
+def set_points(kit: Kit, tasks: Sequence[Task], *, tracking: bool = False) -> list[SetPoint]:
     """One set-point for each control problem of a kit's tasks: the end of a task, else the operating point.
+
+    With ``tracking``, the parts of the loops track the kit's parameters.
 
     Raises:
         InputError: If the kit lacks a control problem or noise.
@@ -420,7 +434,8 @@ def set_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:
         named = sorted((task.name for task in own), key=lambda name: name not in at)
         first = named[0] if named else ""
         asked = first if first in kit.loop.control else ""
-        controller, estimator = kit.controller(task=asked), kit.observer(task=asked)
+        controller = kit.controller(task=asked, tracking=tracking)
+        estimator = kit.tracking_observer(task=asked) if tracking else kit.observer(task=asked)
         row = at.get(first, (controller.controller.problem.standing()[0], model.w))
         found.append(SetPoint(model, problem, tuple(named), row[0], row[1], estimator, controller))
     return found
@@ -863,9 +878,17 @@ def _linear_loops(point: SetPoint) -> Callable[..., LinearLoop]:
     """The linearized loop of controller and quiet filter, as a function of the delay of all inputs [periods]."""
     model, (x, u) = point.model, point.rest
     h = hidden_fixed_point(model, x, u, w=point.w)
-    gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.w)
-    system = linearize(model, x, u, h)
-    return partial(mpc_loop, gain, steady_filter(quiet(point.estimator), x, u, h, system=system), system)
+    gain = solved_gain(point.controller.controller, x, u, point.reference, h, w=point.planned_w)
+    plant, ekf = linearize(model, x, u, h), quiet(point.estimator)
+    if not isinstance(point.estimator, TrackingFilter):
+        return partial(mpc_loop, gain, steady_filter(ekf, x, u, h, system=plant), plant)
+    # the filter's deviations theta move the planned values: du = by_measured (dw / dtheta) dtheta, at theta = 0
+    fitted = point.planned_w[model.n_w :]
+    relative = [one.relative for one in point.estimator.tracked]
+    assert gain.by_measured is not None
+    by_theta = gain.by_measured[:, model.n_w :] * np.where(relative, fitted, 1.0)
+    gain = replace(gain, by_state=np.hstack([gain.by_state, by_theta]))
+    return partial(mpc_loop, gain, steady_filter(ekf, x, u, np.append(h, 0.0 * fitted)), plant)
 
 
 def _find_distance(points: Sequence[SetPoint], signal: Signal) -> float | None:
@@ -927,21 +950,24 @@ def late_inputs(kit: Kit, point: SetPoint, lacking_s: float = 0.0) -> Promise | 
         return not tried(other, plant, start, periods, late=late).why
 
     remedy = LATE
-    if settles(replace(point, estimator=kit.observer(task=_find_own_problem(kit, point), kind="ekf"))):
-        remedy += ' Or use kit.observer(kind="ekf"): with it, the loop settles.'
-    slower = (_with_change_weights(point, kit.models["prior"], factor) for factor in SLOWER)
+    make = kit.tracking_observer if point.tracking else kit.observer
+    if settles(replace(point, estimator=make(task=_find_own_problem(kit, point), kind="ekf"))):
+        remedy += f' Or use kit.{make.__name__}(kind="ekf"): with it, the loop settles.'
+    slower = (_with_change_weights(kit, point, factor) for factor in SLOWER)
     if (gentle := next(filter(settles, slower), None)) is not None:
         weights = ", ".join(f"{v:g}" for v in gentle.problem.r_delta)
         remedy += f" Or set r_delta=({weights},): then the loop settles."
     return Promise(LATE_INPUTS, "doubted", evidence, remedy)
 
 
-def _with_change_weights(point: SetPoint, prior: HybridModel, factor: float) -> SetPoint:
+def _with_change_weights(kit: Kit, point: SetPoint, factor: float) -> SetPoint:
     """The same set-point with ``factor`` times the weights of input changes; times ``r`` for an input without one."""
     problem = point.problem.changed(
         r_delta=factor * np.where(point.problem.r_delta > 0, point.problem.r_delta, point.problem.r)
     )
-    return replace(point, problem=problem, controller=make_controller(point.model, prior, problem))
+    task = _find_own_problem(kit, point)
+    own = replace(kit, loop=replace(kit.loop, control={**kit.loop.control, task: problem}))
+    return replace(point, problem=problem, controller=own.controller(task=task, tracking=point.tracking))
 
 
 # Limits.
@@ -1312,6 +1338,34 @@ def examine(
         ``for promise in examine(kit, scenario.tasks): print(promise)``
     """
     points = set_points(kit, tasks)
+    every = _find_trials(points, report)
+    own = [one for trials in every for one in trials]
+    report(len(points), len(points), "margins, limits, observer")
+    fails = failing_loop(points, every)
+    time = step_time([one for one in own if not one.fails] or own, 1e3 * points[0].model.dt)
+    of_model = horizon(points), margins(points, _find_prior_points(kit, tasks), lacking_delay)
+    of_observer = process_noise(kit), innovations(tested)
+    of_tracking = examine_tracking(kit, tasks, lacking_delay, report)
+    if fails is not None:  # with a failing loop, rows about settled loops have no meaning
+        return (fails, time, *of_model, *of_observer, *of_tracking)
+    elsewhere = loads_elsewhere(kit, points[0])
+    late = late_inputs(kit, points[0], lacking_delay)
+    return (
+        *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
+        *([] if elsewhere is None else [elsewhere]),
+        tasks_end(ends, where),
+        time,
+        *of_model,
+        *([] if late is None else [late]),
+        limits(points, own, given_way or {}, largest_violation(points[0], excess or {}, where)),
+        *of_observer,
+        disturbance_model(points, [trials[0] for trials in every]),
+        *of_tracking,
+    )
+
+
+def _find_trials(points: Sequence[SetPoint], report: Callable[[int, int, str], None]) -> list[list[Trial]]:
+    """Loops on wrong models with loads, for each set-point."""
     lengths = [LASTS * point.problem.horizon for point in points]
     draws = min(max(round(PERIODS / sum(lengths)), FEWEST), MOST)
     every: list[list[Trial]] = []
@@ -1327,27 +1381,40 @@ def examine(
                 trials[worst], why=f"{trials[worst].why}; {_explain_longer_trial(longer)}"
             )
         every.append(trials)
-    own = [one for trials in every for one in trials]
-    report(len(points), len(points), "margins, limits, observer")
+    return every
+
+
+def examine_tracking(
+    kit: Kit,
+    tasks: Sequence[Task],
+    lacking_delay: float = 0.0,
+    report: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> tuple[Promise, ...]:
+    """The rows on offset, late inputs, step time and margins, of the loops with tracked parameters; empty without.
+
+    Args:
+        kit: The kit.
+        tasks: The scenario's tasks.
+        lacking_delay: As for :func:`examine`. Default: none.
+        report: As for :func:`examine`. Default: no report.
+    """
+    if not kit.loop.tracked:
+        return ()
+    try:
+        points = set_points(kit, tasks, tracking=True)
+    except InputError as error:  # e.g. undetectable disturbances at other values of the parameters
+        remedy = "Track other parameters (docs/tracking.md#decide-yourself)."
+        return (Promise("closed loop, tracking", "not promised", str(error), remedy),)
+    every = _find_trials(points, report)
     fails = failing_loop(points, every)
-    time = step_time([one for one in own if not one.fails] or own, 1e3 * points[0].model.dt)
-    of_model = horizon(points), margins(points, _find_prior_points(kit, tasks), lacking_delay)
-    of_observer = process_noise(kit), innovations(tested)
-    if fails is not None:  # with a failing loop, rows about settled loops have no meaning
-        return (fails, time, *of_model, *of_observer)
-    elsewhere = loads_elsewhere(kit, points[0])
-    late = late_inputs(kit, points[0], lacking_delay)
-    return (
+    own = [one for trials in every for one in trials if not one.fails]
+    rows = [
         *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
-        *([] if elsewhere is None else [elsewhere]),
-        tasks_end(ends, where),
-        time,
-        *of_model,
-        *([] if late is None else [late]),
-        limits(points, own, given_way or {}, largest_violation(points[0], excess or {}, where)),
-        *of_observer,
-        disturbance_model(points, [trials[0] for trials in every]),
-    )
+        late_inputs(kit, points[0], lacking_delay),
+    ]
+    time = step_time(own or every[0], 1e3 * points[0].model.dt)
+    rows = [*(rows if fails is None else [fails]), time, margins(points, lacking_delay=lacking_delay)]
+    return tuple(replace(row, name=f"{row.name}, tracking") for row in rows if row is not None)
 
 
 def _find_prior_points(kit: Kit, tasks: Sequence[Task]) -> list[SetPoint]:

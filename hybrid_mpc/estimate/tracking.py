@@ -1,10 +1,10 @@
 """Tracked parameters: slow states of an observer beside state, hidden state and disturbances.
 
 The deviation ``theta`` of a tracked parameter from its fitted value is a stationary first-order process with the
-standard deviation ``std`` that was found between recordings, and the time constant ``time``, by default a day:
+standard deviation ``std`` between recordings and the time constant ``time`` of its drift, by default a day:
 ``theta_{k+1} = a theta_k + w_k``, ``a = exp(-dt / time)``, ``w_k ~ N(0, (1 - a^2) std^2)``. So without excitation the
 covariance of ``theta`` cannot exceed ``std^2`` (a random walk's would grow without bound), the estimate stays where it
-is, and over a day it returns to the fitted value. A parameter stays within its bounds by a saturation of ``theta``.
+is, and over ``time`` it returns to the fitted value. A parameter stays within its bounds by a saturation of ``theta``.
 
 For controller and monitor a tracked parameter is a measured disturbance: :func:`with_tracked` makes it one.
 
@@ -43,7 +43,7 @@ from hybrid_mpc.rules import Name, Positive
 
 Array = NDArray[np.float64]
 DAY = 86400.0
-"""Time [s] in which a tracked parameter returns to its fitted value without excitation."""
+"""Time constant [s] of a parameter's drift: all but constant in a recording of minutes or hours."""
 FARTHEST = 3.0
 """Largest relative deviation of a parameter, as a logarithm, whose bound is zero."""
 NEAREST = 1e-6
@@ -60,7 +60,7 @@ class TrackedParameter:
         name: Name of the parameter of the prior.
         std: Standard deviation of its values between recordings: relative [-], or in the parameter's unit.
         relative: Whether ``std`` is relative. Default: False.
-        time: Time constant [s] of its return to the fitted value. Default: a day.
+        time: Time constant [s] of its drift, and of its return to the fitted value without excitation. Default: a day.
     """
 
     name: Name
@@ -75,14 +75,26 @@ class TrackedParameter:
         """Factor ``a`` [-] of its deviation after a period ``dt`` [s] without excitation."""
         return math.exp(-dt / self.time)
 
-    def words(self, unit: str) -> str:
-        """Its standard deviation as text; ``unit`` is the parameter's.
+    def drift(self, over: float) -> float:
+        """Standard deviation of its change over a time ``over`` [s]; relative, or in the parameter's unit.
+
+        ``E (theta_{k+n} - theta_k)^2 = 2 std^2 (1 - a^n)``.
+        """
+        return self.std * math.sqrt(-2.0 * math.expm1(-over / self.time))
+
+    def words(self, unit: str, over: float) -> str:
+        """Its standard deviation, and its drift over a time ``over`` [s], as text; ``unit`` is the parameter's.
 
         Example:
-            >>> TrackedParameter("gain", 0.2, relative=True).words("V"), TrackedParameter("bias", 0.5).words("V")
-            ('20 %', '0.5 V')
+            >>> TrackedParameter("gain", 0.2, relative=True).words("V", 60.0)
+            '20 %, drift 0.745 % in 60 s'
+            >>> TrackedParameter("bias", 0.5, time=600.0).words("V", 60.0)
+            '0.5 V, drift 0.218 V in 60 s'
         """
-        return f"{100 * self.std:.3g} %" if self.relative else f"{self.std:.3g} {unit}"
+        std, drift = (
+            f"{100 * v:.3g} %" if self.relative else f"{v:.3g} {unit}" for v in (self.std, self.drift(over))
+        )
+        return f"{std}, drift {drift} in {over:g} s"
 
 
 def is_relative(parameter: Parameter) -> bool:

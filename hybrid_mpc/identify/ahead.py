@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,14 @@ from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.estimate.switching import Filter
-from hybrid_mpc.estimate.tracking import TrackedEstimate, TrackedParameter, TrackingFilter, shown_parameters
+from hybrid_mpc.estimate.tracking import (
+    DAY,
+    TrackedEstimate,
+    TrackedParameter,
+    TrackingFilter,
+    shown_parameters,
+)
+from hybrid_mpc.estimate.tuning import log_likelihood
 from hybrid_mpc.identify.varying import WORTH, Varying
 from hybrid_mpc.model.model import HybridModel
 
@@ -32,6 +39,8 @@ HARM = 1.02
 """Ratio of an output's error with tracking to that without, up to which tracking does no harm."""
 WATCHED, RECORDINGS = 1500, 12
 """Largest number of periods of a recording, and of evenly chosen recordings, over which observers are compared."""
+TIMES = 6
+"""Time constants of a parameter's drift that are tried: from a day to the horizon, on a logarithmic scale."""
 UNLEARNED = 0.5
 """The recordings do not separate load and parameter if two ratios exceed this value: a parameter's standard deviation
 late in a recording over that at its start, and the load with tracking over the load without. In an example the ratios
@@ -156,7 +165,8 @@ class Tracking:
         tracked: The parameters; empty if tracking does not improve predictions.
         ratio: Error of predictions over that without tracking, by output [-]; 1 without tracked parameters.
         horizon: Length [s] of the predictions.
-        tried: Mean ratio of errors of each set of parameters that was tried, by their names, ``"a, b"``.
+        tried: Mean ratio of errors of each set of parameters that was tried, by their names, ``"a, b"``; of parameters
+            that drift by names and time constants, ``"a (600 s), b"``.
         doubts: Reasons why something other than the tracked parameters may change. Default: none.
     """
 
@@ -181,6 +191,9 @@ def choose_tracked(
     added, one after the other, as long as the error falls by 3 % and no output's error rises by 2 % in each set of
     evidence. All varying parameters together and all candidates together are also tried. A parameter that the user
     declares as varying is always tracked.
+
+    Each parameter is a candidate without drift (time constant of a day), and with the drift for which the observer's
+    innovations are most likely, if their log-likelihood is clearly larger. A declared time constant is kept.
 
     Two sets are needed, because each alone is biased. A prior fitted to the same recordings predicts them better than
     new ones, so the gain by tracking is too small. A prior fitted to fewer recordings is worse than the deployed prior,
@@ -228,22 +241,44 @@ def choose_tracked(
             if math.exp(float(outputs[-1].mean())) > needed:
                 break
         mean = math.exp(float(np.max([o.mean() for o in outputs])))
-        tried[", ".join(one.name for one in chosen)] = mean
+        tried[", ".join(one.name + ("" if one.time == DAY else f" ({one.time:.3g} s)") for one in chosen)] = (
+            mean
+        )
         return mean, np.exp(np.max(outputs, axis=0))
+
+    def drifting(one: TrackedParameter) -> tuple[TrackedParameter, ...]:
+        """The parameter with the drift of the largest likelihood; empty if that is no better than without drift.
+
+        Source: Schweppe, *Evaluation of likelihood functions for Gaussian signals*, IEEE T-IT 11 (1965).
+        """
+        some = [replace(one, time=float(time)) for time in np.geomspace(DAY, min(horizon, DAY), TIMES)]
+        logs: list[float] = []
+        for own in some:
+            filters = [(TrackingFilter(o, [own]).inner, part) for o, part in sets[-1]]
+            logs.append(sum(log_likelihood(inner, t) for inner, part in filters for t in part))
+            if logs[-1] < max(logs) - WORTH:  # past the maximum
+                break
+        best = int(np.argmax(logs))
+        return (some[best],) if logs[best] > logs[0] + WORTH else ()
 
     own = [p for p in varying.parameters if p.declared and p.varies]
     best: tuple[TrackedParameter, ...] = tuple(p.tracked() for p in own)
     ratio, outputs = judged(best) if best else (1.0, np.ones(len(names)))
-    pool = {
-        p.name: p.tracked(p.alone)
+    pool = [
+        p.tracked(p.alone)
         for p in varying.parameters
         if not p.declared and p.alone > 0 and p.gain >= WORTH and p.name not in shown
-    }
+    ]
+    drifts = [d for one in (*pool, *(p.tracked() for p in own if p.time is None)) for d in drifting(one)]
     varies = tuple(p.tracked() for p in varying.parameters if p.varies and p.name not in shown)
-    together = [varies, (*best, *pool.values())]
+    together = [varies, (*best, *pool)]
     while True:
-        have = {one.name for one in best}
-        trials = [(*best, one) for name, one in pool.items() if name not in have]
+        have = {one.name: one.time for one in best}
+        trials = [
+            (*(b for b in best if b.name != one.name), one)
+            for one in (*pool, *drifts)
+            if one.time < have.get(one.name, math.inf)
+        ]
         trials += [one for one in together if len(one) > len(best) + 1]
         together = []
         found = [(*judged(trial, BETTER * ratio), trial) for trial in trials]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.errors import InputError
-from hybrid_mpc.estimate.tracking import TrackedParameter, is_relative
+from hybrid_mpc.estimate.tracking import DAY, TrackedParameter, is_relative
 from hybrid_mpc.identify.fit import smoothed
 from hybrid_mpc.identify.output_fit import OutputFit
 from hybrid_mpc.identify.prior_result import PriorFit
@@ -69,6 +69,7 @@ class VaryingParameter:
         gain: Log evidence by which ``alone`` exceeds a fixed parameter [-].
         relative: Whether the deviations are normal on a logarithmic scale; else on the parameter's own.
         declared: Whether the user has decided (``Parameter(..., varies=...)``).
+        time: Declared time constant [s] of its drift within a recording. Default: none was declared.
     """
 
     name: str
@@ -79,6 +80,7 @@ class VaryingParameter:
     gain: float
     relative: bool
     declared: bool = False
+    time: float | None = None
 
     @property
     def varies(self) -> bool:
@@ -88,7 +90,8 @@ class VaryingParameter:
     def tracked(self, std: float | None = None) -> TrackedParameter:
         """The parameter as an observer tracks it, with :attr:`std` or another standard deviation [unit]."""
         own = self.std if std is None else std
-        return TrackedParameter(self.name, own / abs(self.value) if self.relative else own, self.relative)
+        size = own / abs(self.value) if self.relative else own
+        return TrackedParameter(self.name, size, self.relative, self.time or DAY)
 
 
 @dataclass(frozen=True)
@@ -180,13 +183,13 @@ def find_varying(
         quadratics.append((j.T @ j, -j.T @ e))
     evidence = _Evidence(np.array([a for a, _ in quadratics]), np.array([c for _, c in quadratics]))
     unit_of = scale * of.unit  # from deviations to the parameters' units
-    wanted = [p.varies for p in of.free]
+    wanted = [p.varies[0] if isinstance(p.varies, tuple) else p.varies for p in of.free]
     given = np.array([math.nan if v is None or isinstance(v, bool) else v for v in wanted]) / unit_of
     std, alone, gain = _chosen(evidence, [v is False for v in wanted], [v is True for v in wanted], given)
     found = tuple(
         VaryingParameter(
             p.name, p.unit, fit.values[p.name], float(s * u), float(a * u), float(g), bool(r),
-            p.varies is not None,
+            p.varies is not None, p.varies[1] if isinstance(p.varies, tuple) else None,
         )
         for p, s, a, g, u, r in zip(of.free, std, alone, gain, unit_of, relative, strict=True)
     )  # fmt: skip

@@ -339,12 +339,15 @@ class Kit:
 
     @property
     def identity(self) -> str:
-        """Digest of everything that promises depend on: models, recommended model, its observer, control problems."""
+        """Digest of everything that promises depend on: models, recommended model, its observer, control problems,
+        tracked parameters.
+        """
         own = f"{self.recommended}_observer"
         noise = {name: sigma for name, sigma in self.loop.process_noise.items() if name == own}
         loop = replace(self.loop, causes={}, tasks=(), safe_input=None, process_noise=noise)
         plain_loop = plain(loop)
-        del plain_loop["tracked"]  # promises are those of loops that do not track
+        if not loop.tracked:
+            del plain_loop["tracked"]  # as in kits of older versions
         return digest([self.programs_sha256, self.recommended, self.input_delay, plain_loop])
 
     @property

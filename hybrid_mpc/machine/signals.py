@@ -138,12 +138,13 @@ class Parameter:
         lower: Lower bound of the fit [unit].
         upper: Upper bound of the fit [unit]. ``lower == upper`` keeps the parameter fixed.
         description: A few words, printed in tables.
-        varies: Whether the parameter differs between recordings (docs/tracking.md): True, False, or its standard
-            deviation between recordings [unit]. Default: the recordings decide.
+        varies: Whether the parameter differs between recordings (docs/tracking.md): True, False, its standard
+            deviation between recordings [unit], or ``(deviation, time)`` with the time constant [s] of its drift within
+            them. Default: the recordings decide.
 
     Raises:
-        InputError: With all problems: a field of a wrong kind, a value outside its bounds, or a standard deviation that
-            is not positive.
+        InputError: With all problems: a field of a wrong kind, a value outside its bounds, or a standard deviation or
+            time that is not positive.
 
     Example:
         >>> Parameter("m", 0.5, "kg", 0.1, 2.0).fixed
@@ -156,7 +157,7 @@ class Parameter:
     lower: Bound
     upper: Bound
     description: Line = ""
-    varies: bool | Number | None = None
+    varies: bool | Number | tuple[Number, Number] | None = None
 
     def __post_init__(self) -> None:
         own = Fields(self, f"parameter {self.label}")
@@ -165,8 +166,9 @@ class Parameter:
             f"value {self.value} is outside its bounds [{self.lower}, {self.upper}] [HM-MACHINE-022]",
         )  # fmt: skip
         own.need(
-            "varies", lambda: self.varies is None or isinstance(self.varies, bool) or self.varies > 0,
-            f"varies must be True, False or a positive standard deviation, got {self.varies} [HM-MACHINE-045]",
+            "varies", lambda: self.varies is None or isinstance(self.varies, bool) or np.min(self.varies) > 0,
+            "varies must be True, False, a positive standard deviation, or that and a positive time, got "
+            f"{self.varies} [HM-MACHINE-045]",
         )  # fmt: skip
         own.refuse()
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import control
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from hybrid_mpc import (
     Disturbance,
     Estimate,
     ExtendedKalmanFilter,
+    HybridModel,
     InputError,
+    Signal,
     balanced_truncation,
     linearize,
     mpc_gain,
@@ -134,6 +137,19 @@ def test_loops_of_outputs_and_of_any_disturbance_model_leave_no_offset(at):
     a, b, c = (np.asarray(m) for m in (closed.A, closed.B, closed.C))
     from_load = c[:1] @ np.linalg.solve(np.eye(len(a)) - a, b[:, :1])
     assert abs(from_load.item()) < 1e-4
+
+
+def test_a_measured_disturbance_moves_the_input_to_its_new_steady_state():
+    x, u, g = (ca.MX.sym(name) for name in "xug")
+    signal, gain = (Signal("x", "-", -5.0, 5.0),), Signal("g", "-", 0.5, 2.0)
+    model = HybridModel.of(
+        "tank", 0.1, signal, (Signal("u", "-"),), signal, x=x, u=u, w=g, x_next=0.9 * x + 0.1 * g * u,
+        xdot=g * u - x, y=x, disturbances=(gain,), nominal_w=(1.0,),
+    )  # fmt: skip
+    problem = OCP(20, [0.0], [0.0], [1e-6], [-50.0], [50.0], q_y=[10.0])
+    found = solved_gain(CondensedController(model, problem), [0.3], [0.3], [0.3])
+    # at the set-point the input x / g holds it: its derivative is -x / g^2; the weight of changes is all but zero
+    np.testing.assert_allclose(found.by_measured, [[-0.3]], atol=1e-4)
 
 
 def test_gain_of_solves_at_a_bound_is_refused():

@@ -23,6 +23,7 @@ from hybrid_mpc import (
     Provenance,
     Signal,
     Task,
+    TrackedParameter,
     load,
     set_process_noise,
 )
@@ -88,6 +89,20 @@ def test_a_good_kit_promises_everything(good):
         "shown",
     )  # fmt: skip
     assert all(not row.remedy for row in good[1])
+
+
+def test_a_kit_that_tracks_promises_its_tracking_loop_too(good):
+    kit = good[0].with_tracked([TrackedParameter("g", 0.2, relative=True)])
+    assert verdicts(p.examine_tracking(kit, [hold()])) == dict.fromkeys(
+        (f"{name}, tracking" for name in ("no offset", "late inputs", "step time", "stability margins")),
+        "shown",
+    )
+    assert p.examine_tracking(good[0], [hold()]) == ()
+    # a gain that is taken to change at random within two periods: the input follows the noise of its estimate
+    wild = good[0].with_tracked([TrackedParameter("g", 5.0, relative=True, time=0.2)])
+    (point,) = p.set_points(wild, [hold()], tracking=True)
+    assert p.margins([point]).verdict == "doubted"
+    assert p.margins([point_of(wild)]).verdict == "shown"
 
 
 def test_trials_are_on_wrong_models_with_loads_and_always_the_same(good):

@@ -155,6 +155,7 @@ REFUSED = {
         f"a parameter that varies by {size:g}": (code, lambda v=size: Parameter("k", 1.0, "-", 0.0, 2.0, varies=v))
         for size, code in ((0.0, "MACHINE-045"), (-1.0, "MACHINE-045"), (math.nan, "RECORDS-012"))
     },
+    "a drift without time": ("MACHINE-045", lambda: Parameter("k", 1.0, "-", 0.0, 2.0, varies=(0.1, 0.0))),
 }  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import pytest
 from hybrid_mpc import InputError, Parameter, Prior, Signal, fit_prior
 from hybrid_mpc.data.trajectories import Trajectory
 from hybrid_mpc.estimate.kalman import ExtendedKalmanFilter
-from hybrid_mpc.estimate.tracking import TrackedParameter, TrackingFilter
+from hybrid_mpc.estimate.tracking import DAY, TrackedParameter, TrackingFilter
 from hybrid_mpc.identify.ahead import _unlearned, choose_tracked, errors_ahead
 from hybrid_mpc.identify.own_fits import fit_each
 from hybrid_mpc.identify.prior_model import model_info, prior_programs
@@ -108,7 +108,7 @@ def test_the_user_decides():
         parameters = (
             Parameter("gain", 2.0, "K/W", 0.2, 10.0, varies=False),
             Parameter("tau", 1.0, "s", 0.1, 10.0, varies=True),
-            Parameter("bias", 0.0, "W", -2.0, 2.0, varies=0.05),
+            Parameter("bias", 0.0, "W", -2.0, 2.0, varies=(0.05, 60.0)),
         )
 
     _, found = varying_of(Declared, recorded([2.0] * 3))
@@ -116,6 +116,8 @@ def test_the_user_decides():
     assert own["gain"].std == 0.0
     assert own["gain"].declared
     assert own["bias"].std == pytest.approx(0.05)
+    assert own["bias"].tracked().time == 60.0
+    assert own["tau"].tracked().time == DAY
     assert own["tau"].std > 0
 
 
@@ -130,8 +132,9 @@ def observer(fit, make=Heater):
 
 def test_predictions_from_the_observer_improve_where_a_parameter_varies():
     fit, found = varying_of(Heater, recorded(GAINS))
-    chosen = choose_tracked([[(observer(fit), recorded(GAINS, seed=5))]], found, 2.0, warm_up=1.0)
+    chosen = choose_tracked([[(observer(fit), recorded(GAINS[:4], seed=5))]], found, 2.0, warm_up=1.0)
     assert chosen.tracked[0].name == "gain"
+    assert chosen.tracked[0].time == DAY  # the gain is constant within each recording
     assert chosen.ratio["heat"] < 0.8
     assert chosen.doubts == ()
     held = recorded([1.4, 2.8], seed=9)
@@ -140,6 +143,34 @@ def test_predictions_from_the_observer_improve_where_a_parameter_varies():
     assert tracked.names == ("day0", "day1")
     assert tracked.starts == plain.starts
     assert (tracked.rmse < 0.4 * plain.rmse).all()
+
+
+def drifting(n, seed, std=0.3, time=15.0):
+    """Recordings of 40 s whose gain is a stationary process with this time constant [s]."""
+    found, a, e = [], np.exp(-DT / time), np.exp(-DT)
+    for i, t in enumerate(recorded([2.0] * n, seed=seed)):
+        rng, x = np.random.default_rng([seed, i]), np.zeros_like(t.y)
+        theta = std * rng.standard_normal()
+        for k in range(len(x) - 1):
+            x[k + 1] = e * x[k] + (1 - e) * 2.0 * np.exp(theta) * t.u[k]
+            theta = a * theta + std * np.sqrt(1 - a * a) * rng.standard_normal()
+        found.append(replace(t, y=x + SIGMA * rng.standard_normal(x.shape)))
+    return found
+
+
+def test_a_gain_that_changes_within_recordings_has_a_drift():
+    fit, found = varying_of(Heater, drifting(6, 0))
+    only = replace(found, parameters=found.parameters[:1])
+    (gain,) = choose_tracked([[(observer(fit), drifting(3, 1))]], only, 2.0, warm_up=1.0).tracked
+    assert gain.time < 100.0
+    held, plain = drifting(3, 2), replace(gain, time=DAY)
+    drifts, constant = (
+        errors_ahead(TrackingFilter(observer(fit), [one]), held, 2.0, warm_up=10.0) for one in (gain, plain)
+    )
+    assert (drifts.pooled < 0.7 * constant.pooled).all()  # about a half
+    given = replace(only.parameters[0], declared=True, time=1000.0)
+    (kept,) = choose_tracked([[(observer(fit), held)]], replace(found, parameters=(given,)), 2.0).tracked
+    assert kept.time == 1000.0
 
 
 def test_nothing_is_tracked_that_does_not_vary():

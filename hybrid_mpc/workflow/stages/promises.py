@@ -24,6 +24,7 @@ from hybrid_mpc.workflow.stages.explain import EXPLAIN
 from hybrid_mpc.workflow.stages.export import EXPORT, NOISE
 from hybrid_mpc.workflow.stages.identify import PRIOR, PriorResult
 from hybrid_mpc.workflow.stages.on_model import LOOPS_ON_MODEL, what_on_model_reads
+from hybrid_mpc.workflow.stages.track import TRACK
 
 STRUCTURE = "structure of the prior"
 """Name of the row about the prior, which all models are based on."""
@@ -167,5 +168,6 @@ def what_promises_read(context: Context) -> Mapping[str, object]:
 
 PROMISES = Stage(
     "promises", "examining the kit's promises", PromiseTable, promises_stage, what_promises_read,
-    (EXPLAIN, PRIOR, CHOICE, EXPORT, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True, restore=put_promises,
+    (EXPLAIN, PRIOR, CHOICE, EXPORT, TRACK, NOISE, CONTROL, LOOPS_ON_MODEL, ESTIMATION), optional=True,
+    restore=put_promises,
 )  # fmt: skip

@@ -605,7 +605,7 @@ def _varying_table(found: TrackResult) -> Table:
     tracked = {one.name: one for one in found.tracking.tracked}
     rows = [
         (f"{p.name} [{p.unit}]", p.value, p.std or "fixed", p.gain,
-         tracked[p.name].words(p.unit) if p.name in tracked else "no")
+         tracked[p.name].words(p.unit, found.tracking.horizon) if p.name in tracked else "no")
         for p in found.varying.parameters
     ]  # fmt: skip
     of = "blocks of the recording" if found.varying.blocks else "recordings"
@@ -614,10 +614,11 @@ def _varying_table(found: TrackResult) -> Table:
         f" Prediction errors over {found.tracking.horizon:g} s with tracking, over those without: {ratios}."
     )
     return Table(
-        ("parameter", "fitted", "deviation, all together", "evidence, alone", "tracked with a deviation of"), rows,
+        ("parameter", "fitted", "deviation, all together", "evidence, alone", "tracked with deviation and drift"), rows,
         f"Standard deviations of the parameters between {found.varying.pieces} {of}. If all parameters may vary, some "
         "parameters replace others and are fixed. Evidence: gain of the log evidence if one parameter alone varies. "
-        "The deviation of a tracked parameter is that of the parameter alone, or of all together."
+        "The deviation of a tracked parameter is that of the parameter alone, or of all together. Drift: standard "
+        "deviation of its change within a recording."
         + (gain if tracked else " Tracking improves no prediction."),
     )  # fmt: skip
 
