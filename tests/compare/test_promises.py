@@ -311,6 +311,31 @@ class Late(CondensedController):
         return super().finish(*given, **also)
 
 
+def falling(stiff):
+    """A mass that falls away from rest, with ``k`` and ``g`` that a fit may move; its position is measured."""
+    x, u, g, dt = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("g", 2), 0.02
+    rate = ca.vertcat(x[1], stiff * g[0] * x[0] + g[1] * u)
+    nxt = x + dt * rate + 0.5 * dt**2 * ca.vertcat(rate[1], stiff * g[0] * x[1])
+    q, v = Signal("q", "m", -1.0, 1.0), Signal("v", "m/s", -5.0, 5.0)
+    model = HybridModel.of(
+        "fall", dt, (q, v), (Signal("u", "m/s^2", -20.0, 20.0),), (q,), x=x, u=u, p=g, x_next=nxt, xdot=rate, y=x[0],
+        parameters=tuple(Parameter(name, 1.0, "-", 0.5, 2.0) for name in "kg"),
+    )  # fmt: skip
+    return replace(model, state_spread=(0.2, 1.0))
+
+
+def test_where_loops_do_not_settle_noise_at_the_inputs_is_named_if_it_helps():
+    problem = OCP(50, [0.0, 0.0], [0.0], [1.0], [-20.0], [20.0], q_y=[400.0])
+    kit = kit_of(falling(25.0), problem, noise=1e-4, sigma=1e-3)
+    point = point_of(kit, Task("hold", "Hold", 4.0, (0.0, 0.0), lambda t: np.full((len(t), 1), 0.05)))
+    periods = p.LASTS * problem.horizon
+    trials = [p.trial(point, draw, periods) for draw in range(3)]
+    row = p.no_offset(point, trials)
+    assert row.verdict == "doubted"
+    assert "input_noise=0.1" in p.advised(row, kit, [point], [trials]).remedy
+    assert p.advised(row, kit, [point], [trials[:1]]) == row  # no loop of these is lost
+
+
 def test_late_steps_are_no_promise():
     kit = kit_of(tank(dt=0.01))
     point = point_of(kit)
