@@ -26,7 +26,7 @@ class StageCurvature:
 
     They are finite differences of the model's exact Jacobians: ``n_x + n_u`` evaluations for the block by states and
     inputs, where friction has large curvature, and ``n_h`` for the blocks by the hidden state. Second derivatives of
-    soft bounds, weighted with their multipliers, are added. Steps are scaled by the states' sizes and inputs' limits.
+    bounds, weighted with their multipliers, are added. Steps are scaled by the states' sizes and inputs' limits.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class StageCurvature:
     ) -> None:
         self._n_x, self._n_u, self._n_h = ocp.n_x, ocp.n_u, hidden.size
         n_h, self._hidden_shift = hidden.size, SHIFT * hidden
-        self._soft = soft if soft is not None and soft.functions else None
+        self._soft = soft if soft is not None and soft.curved else None
         self._shift = SHIFT * np.concatenate([sizes, ocp.input_scale])
         self._stages = stages
         # more than 200 periods a call would not fit into a core's cache
@@ -73,7 +73,7 @@ class StageCurvature:
         curvature = np.empty((len(b), size, size)) if old is None else old.copy()
         curvature[:, :few, :few] = self._few(z[:-1], u[1], a_t, b, adjoint)
         if self._soft is not None and np.any(soft):
-            curvature[:, :few, :few] += self._of_soft(self._soft, z, u[0], soft, e)
+            curvature[:, :few, :few] += self._soft.curvature(z[:, : self._n_x], u[0], soft, e)
         if old is None and self._n_h:
             rows = self._hidden(z[:-1], u[1], a_t, b, adjoint)
             curvature[:, few:] = rows
@@ -112,25 +112,6 @@ class StageCurvature:
             slopes = (weights @ self._by_hidden(moved.reshape(m * n, -1), inputs)).reshape(m, n, -1)
             rows[chosen] = (slopes - here) / taken[:, :, None]
         return rows.transpose(1, 0, 2)
-
-    def _of_soft(self, soft: BoundRows, z: Array, u: Array, multipliers: Array, e: Array | None) -> Array:
-        """Second derivatives of the soft bounds' expressions, which depend on states and inputs before the last."""
-        n, n_x, m = len(u), self._n_x, self._shift.size
-
-        def slopes(points: Array) -> Array:
-            _, by_x, by_u = soft.linearize(np.vstack([points[:, :n_x], z[-1:, :n_x]]), points[:, n_x:], e)
-            total = np.zeros((n + 1, m))
-            np.add.at(total, soft.stage, multipliers[:, None] * np.hstack([by_x, by_u]))
-            return total[:-1]  # bounds on states are linear
-
-        here = np.hstack([z[:-1, :n_x], u])
-        before, rows = slopes(here), []
-        for j in range(m):
-            moved = here.copy()
-            moved[:, j] += self._shift[j]
-            rows.append((slopes(moved) - before) / (moved - here)[:, j, None])
-        curvature = np.stack(rows, axis=1)
-        return np.asarray(0.5 * (curvature + curvature.transpose(0, 2, 1)))
 
     def condensed(self, curvature: Array, from_u: Array, by_inputs: Array) -> Array:
         """The stages' curvature as that of the inputs ``(N n_u, N n_u)``; ``by_inputs`` from the ``Condenser``."""

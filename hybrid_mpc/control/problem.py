@@ -72,15 +72,17 @@ class Solution:
         kkt: KKT residual in the QP's scaling, relative to its gradient [-]; for ``ipopt`` that of the NLP.
         defect: Largest defect ``|x_{k+1} - f(x_k, h_k, u_k)|`` at the last linearization, over (x, h).
         timing: Durations [ms] by name (``prepare``, ``feedback``); for information only.
-        excess: Largest violation of a soft bound in the plan [its unit].
+        excess: Largest violation of a soft bound along ``x`` and ``u`` [its unit].
         iterations: Linearizations (or iterations of the nonlinear solver) of this solve.
         curvature: Second derivatives of the stages by ``(x, u, h)`` ``(N, n, n)``, or by ``(x, u)`` if those of the
             hidden state hardly matter, with which ``sqp`` starts its next solve; None from other solvers.
         w: Measured disturbances ``(N, n_w)`` assumed by the prediction.
         steady: The steady state for the first row of an outputs' reference; None if references are the states'.
         active: Active rows of the QP, the warm start of the next solve. None: cold start.
-        given_way: Hard bounds that are infeasible and relaxed in the plan: largest violation by name. A state has its
-            name in the model, an output is ``output`` and its name, an expression has its function's name.
+        given_way: Hard bounds that the plan violates: largest violation by name. A state has its name in the model, an
+            output is ``output`` and its name, an expression has its function's name.
+        multipliers: Multipliers ``(M,)`` of the bounds [cost per unit], by which the next real-time iteration weighs
+            the curvature of the bounds. None: zero.
     """
 
     u: Array
@@ -99,6 +101,7 @@ class Solution:
     steady: Steady | None = None
     active: Active | None = None
     given_way: Mapping[str, float] = field(default_factory=dict)
+    multipliers: Array | None = None
 
     @property
     def following(self) -> Array:
@@ -118,7 +121,8 @@ class Solution:
         c = self.curvature
         c = None if c is None else np.concatenate([c[:1], c[:-1]])
         return replace(
-            self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c, active=None
+            self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c, active=None,
+            multipliers=None,
         )
 
 
@@ -147,6 +151,8 @@ class BoundRows:
     """Names of the rows ``(M,)``."""
     parametric: bool
     """Whether a bounded value depends on ``e``."""
+    curved: bool
+    """Whether a bounded value is not affine in state and input."""
 
     def __init__(self, ocp: OCP, model: HybridModel, sizes: Sizes) -> None:
         n = ocp.horizon
@@ -161,6 +167,8 @@ class BoundRows:
         self.states: NDArray[np.int64] = np.concatenate([g.states for g in groups]).astype(np.int64)
         """The bounded states, in the order of a period's rows of them; one may be there twice."""
         self._expressions = [BufferedFunction(_with_slopes(f).map(n)) for f in self.functions]
+        self._curvature = [None if is_affine(f) else BufferedFunction(_curvature(f).map(n)) for f in self.functions]
+        self.curved = any(f is not None for f in self._curvature)
         blocks = [[g for g in groups if g.function is None], *([g] for g in groups if g.function is not None)]
         each = [
             np.hstack([g.rows for g in block]) for block in blocks
@@ -235,6 +243,22 @@ class BoundRows:
             np.vstack([r[1] for r in rows]),
             np.vstack([r[2] for r in rows]),
         )
+
+    def curvature(self, x: Array, u: Array, multipliers: Array, e: Array | None = None) -> Array:
+        """Second derivatives by ``(x, u)`` of each period's values, weighted with ``multipliers`` ``(M,)`` and summed:
+        ``(N, n_x + n_u, n_x + n_u)``.
+        """
+        n, size, first = self._horizon, self._n_x + self._n_u, self._rows.size
+        total = np.zeros((n, size, size))
+        for f, g in zip(self._curvature, self.functions, strict=True):
+            own = multipliers[first : first + n * g.numel_out(0)]
+            first += own.size
+            if f is not None and own.any():
+                f.inputs[0][:], f.inputs[1][:] = x[:-1].ravel(), u.ravel()
+                f.inputs[2][:], f.inputs[3][:] = 0.0 if e is None else e.ravel(), own
+                f()
+                total += f.outputs[0].reshape(n, size, size)
+        return total
 
     def condensed(
         self, x: Array, u: Array, from_u: Array, e: Array | None = None
@@ -449,6 +473,32 @@ def _with_slopes(f: ca.Function) -> ca.Function:
     return ca.Function("soft", [x, u, e], [found, slope[:, :n_x], slope[:, n_x:]])
 
 
+def is_affine(f: ca.Function) -> bool:
+    """Whether ``f(x, u, e)`` is affine in ``x`` and ``u``."""
+    return bool(_curvature(f).nnz_out(0) == 0)
+
+
+def _curvature(f: ca.Function) -> ca.Function:
+    """``(x, u, e, m)`` to the second derivatives of ``m' f`` by ``(x, u)``."""
+    n_x, n_u, n_e = (f.size1_in(i) for i in range(3))
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    z, e, m = kind.sym("z", n_x + n_u), kind.sym("e", n_e), kind.sym("m", f.numel_out(0))
+    both = ca.Function("both", [z, e, m], [ca.hessian(ca.dot(m, f(z[:n_x], z[n_x:], e)), z)[0]], {"cse": True})
+    x, u, e, m = (ca.MX.sym(name, n) for name, n in zip("xuem", (n_x, n_u, n_e, m.numel()), strict=True))
+    return ca.Function("curvature", [x, u, e, m], [both(ca.vertcat(x, u), e, m)])
+
+
+def convex_part(curvature: Array, size: Array) -> Array:
+    """Symmetric matrices ``(N, n, n)`` with zero instead of their negative eigenvalues.
+
+    Eigenvectors are those of the matrix scaled with ``size`` ``(n,)``, so the result does not depend on units.
+    """
+    both = np.outer(size, size)
+    values, vectors = np.linalg.eigh(curvature * both)
+    flat = np.maximum(values, 0.0)[:, None, :]
+    return np.asarray((vectors * flat) @ vectors.transpose(0, 2, 1) / both)
+
+
 def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None:
     """The non-quadratic stage cost, ``(x, u, p) -> scalar``: the economic cost plus that of the outputs.
 
@@ -515,17 +565,9 @@ class StageCost:
         return slope, self._dt * f.outputs[1].reshape(n, slope.shape[1], -1)
 
     def convex(self, x: Array, u: Array, p: Array | None = None) -> tuple[Array, Array]:
-        """The same with positive semi-definite second derivatives: negative curvature is replaced by zero.
-
-        Eigenvectors are those of the scaled matrix, so the result does not depend on units.
-        """
+        """The same with positive semi-definite second derivatives (:func:`convex_part`)."""
         slope, curvature = self.derivatives(x, u, p)
-        if not np.all(np.isfinite(curvature)):
-            return slope, curvature
-        both = np.outer(self.size, self.size)
-        values, vectors = np.linalg.eigh(curvature * both)
-        flat = np.maximum(values, 0.0)[:, None, :]
-        return slope, (vectors * flat) @ vectors.transpose(0, 2, 1) / both
+        return slope, convex_part(curvature, self.size) if np.all(np.isfinite(curvature)) else curvature
 
     def _fill(self, f: BufferedFunction, x: Array, u: Array, p: Array | None) -> None:
         f.inputs[0][:], f.inputs[1][:] = x[: self._n].ravel(), u.ravel()

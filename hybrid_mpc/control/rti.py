@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dgemv
 
 from hybrid_mpc.control.ocp import OCP, Limits
-from hybrid_mpc.control.problem import Problem, Solution, SplitController, Status, Target, weights_ok
+from hybrid_mpc.control.problem import (
+    Problem,
+    Solution,
+    SplitController,
+    Status,
+    Target,
+    convex_part,
+    weights_ok,
+)
 from hybrid_mpc.control.qp import InputQP
 from hybrid_mpc.estimate.kalman import Estimate
 from hybrid_mpc.model.active_set import Active
@@ -23,6 +31,10 @@ Array = NDArray[np.float64]
 NAN = float("nan")
 GROUP = 10
 """Periods whose second derivatives are condensed in one matrix product."""
+CORRECTIONS = 4
+"""Most QPs of a feedback after the first, each with the bounds linearized at the plan of the one before."""
+STRAIGHT = 1e-6
+"""Violation of a curved bound beyond that of its linearization, over its size, up to which a plan is not corrected."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +46,8 @@ class Prepared:
     ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is it times the state weights, ``direct``
     the gradient of the costs of inputs and changes without targets. ``soft`` is the result of
     :meth:`BoundRows.condensed`, ``economic`` are the first derivatives ``(N, n_x + n_u)`` of the economic stage costs
-    and their convexified second derivatives, or None. ``e`` are further arguments of the bounded values.
+    and their convexified second derivatives, or None. ``e`` are further arguments of the bounded values, ``multipliers`` those of
+    the bounds.
     """
 
     u: Array
@@ -56,6 +69,7 @@ class Prepared:
     e: Array
     steady: Steady | None = None
     active: Active | None = None
+    multipliers: Array | None = None
 
 
 class Condenser:
@@ -229,19 +243,22 @@ class CondensedController(SplitController):
         return self.condense(
             u, z, d, previous.u[0], weight, derivatives, start, w=w, steady=previous.steady,
             active=self.qp.later(previous.active),
+            multipliers=None if previous.multipliers is None else previous.multipliers[self.problem.soft.later],
         )  # fmt: skip
 
     @np.errstate(over="ignore", invalid="ignore")
     def linearize(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array, w: Array | None = None,
-        steady: Steady | None = None, active: Active | None = None,
+        steady: Steady | None = None, active: Active | None = None, multipliers: Array | None = None,
     ) -> Prepared:  # fmt: skip
         """Linearize and condense along a trajectory as it is: ``u`` ``(N, n_u)``, ``z`` ``(N + 1, n_z)``, ``w`` ``(N,
         n_w)``.
         """
         start, w = perf_counter(), self.problem.forecast(w, None)
         derivatives = self.stages.at(z[:-1], self.model.acting(u, d, w))
-        return self.condense(u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady, active=active)
+        return self.condense(
+            u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady, active=active, multipliers=multipliers
+        )
 
     @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def feedback(
@@ -258,7 +275,7 @@ class CondensedController(SplitController):
         if target.w is not prepared.w and not np.array_equal(target.w, prepared.w):
             prepared = self.linearize(
                 prepared.u, prepared.z, prepared.d, prepared.u_prev, prepared.weight, target.w, prepared.steady,
-                prepared.active,
+                prepared.active, prepared.multipliers,
             )  # fmt: skip
         hessian, economic = self._at_parameters(prepared, target)
         n_x = self._n_x
@@ -272,35 +289,78 @@ class CondensedController(SplitController):
         if economic is not None:
             slope, curvature = economic
             slope = slope + (curvature[:, :, :n_x] @ free[:-1, :n_x, None])[:, :, 0]
-            gradient += (
-                slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
-            )
+            gradient += self._by_inputs(prepared, slope)
         soft = self._soft_rows(prepared, free, target)
         if not (np.isfinite(gradient).all() and (soft is None or np.isfinite(soft[0]).all())):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        answer = self.qp.solve(
-            hessian, gradient, prepared.u, prepared.u_prev, soft, limits, prepared.active, strict=True
-        )
-        step = answer.step
-        if not answer.status.ok:
-            return self._failed(prepared, answer.status, start, answer.kkt)
-        inputs = step.reshape(prepared.u.shape)
-        u = prepared.u + inputs
-        z = prepared.z + propagate(prepared.a_t, drift + self._of_inputs(prepared.b, inputs), dz0)
-        excess, largest, given_way = None, 0.0, {}
-        if soft is not None:
-            excess = self.problem.soft.excess(soft[0] + soft[1] @ step)
-            largest, given_way = self.problem.soft.largest(excess), self.problem.soft.given_way(excess)
-        cost = self.problem.cost(z, u, prepared.u_prev, target, excess)
-        if not np.isfinite(cost):
-            return self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
+        return self._solved(prepared, target, estimate, (hessian, gradient), soft, (free, drift), limits, start)
+
+    def _solved(
+        self, prepared: Prepared, target: Target, estimate: Estimate, quadratic: tuple[Array, Array],
+        soft: tuple[Array, Array] | None, run: tuple[Array, Array], limits: Limits | None, start: float,
+    ) -> Solution:  # fmt: skip
+        """Solve the QP of Hessian and gradient ``quadratic`` around the run ``(free, drift)``, and check its solution.
+
+        The Hessian also has the curvature of the bounds, weighted with their multipliers (sequential convex quadratic
+        programming). If the plan violates a curved bound more than its linearization, the bounds alone are linearized
+        again at the plan and the QP is solved again, at most :data:`CORRECTIONS` times; the cheapest plan counts.
+
+        Source: Verschueren, van Duijkeren, Quirynen, Diehl, *Exploiting convexity in direct optimal control: a
+        sequential convex quadratic programming method*, CDC 2016.
+        """
+        rows, n_x, best = self.problem.soft, self._n_x, None
+        free, drift = run
         lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
-        u = np.minimum(np.maximum(u, lower), upper)  # the QP only keeps them within its tolerance
-        return Solution(
-            u=u, x=z[:, :n_x], h=z[:, n_x:], d=estimate.d, cost=cost, status=answer.status, kkt=answer.kkt,
-            defect=_largest(prepared.defects), timing=self._timing(prepared, start), excess=largest, w=target.w,
-            steady=target.steady, active=answer.active, given_way=given_way,
-        )  # fmt: skip
+        point, ahead = (prepared.z[:, :n_x], prepared.u), np.hstack([free[:-1, :n_x], np.zeros_like(prepared.u)])
+        multipliers, active = prepared.multipliers, prepared.active
+        for _ in range(1 + CORRECTIONS):
+            hessian, gradient = quadratic
+            if multipliers is not None and multipliers.any():
+                curvature = convex_part(
+                    rows.curvature(*point, multipliers, target.e), self.problem.economic.size
+                )
+                hessian = hessian + condense_hessians(curvature, prepared.from_u, n_x)
+                gradient = gradient + self._by_inputs(prepared, (curvature @ ahead[:, :, None])[:, :, 0])
+            answer = self.qp.solve(
+                hessian, gradient, prepared.u, prepared.u_prev, soft, limits, active, strict=True
+            )
+            if not answer.status.ok:
+                return best or self._failed(prepared, answer.status, start, answer.kkt)
+            step, inputs = answer.step, answer.step.reshape(prepared.u.shape)
+            z = prepared.z + propagate(prepared.a_t, drift + self._of_inputs(prepared.b, inputs), free[0])
+            # the QP only keeps the limits within its tolerance
+            u = np.minimum(np.maximum(prepared.u + inputs, lower), upper)
+            point, excess, largest, given_way, beyond = (z[:, :n_x], u), None, 0.0, {}, 0.0
+            if soft is not None:
+                linear = soft[0] + soft[1] @ step
+                if rows.curved:
+                    value, _, slope = rows.condensed(*point, prepared.from_u, target.e)
+                    excess = rows.excess(value)
+                    beyond = float(np.max((excess - rows.excess(linear)) / rows.scale))
+                    soft = value - slope @ step, slope
+                else:
+                    excess = rows.excess(linear)
+                largest, given_way = rows.largest(excess), rows.given_way(excess)
+            cost = self.problem.cost(z, prepared.u + inputs, prepared.u_prev, target, excess)
+            if not np.isfinite(cost):
+                return best or self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
+            multipliers, active = answer.multipliers if rows.curved else None, answer.active
+            if best is None or cost < best.cost:
+                best = Solution(
+                    u=u, x=z[:, :n_x], h=z[:, n_x:], d=estimate.d, cost=cost, status=answer.status, kkt=answer.kkt,
+                    defect=_largest(prepared.defects), timing=self._timing(prepared, start), excess=largest,
+                    w=target.w, steady=target.steady, active=active, given_way=given_way, multipliers=multipliers,
+                )  # fmt: skip
+            if beyond <= STRAIGHT:
+                break
+            ahead = -np.hstack([(prepared.from_u[: n_x * len(u)] @ step).reshape(-1, n_x), inputs])
+        assert best is not None
+        return replace(best, timing=self._timing(prepared, start))
+
+    def _by_inputs(self, prepared: Prepared, slope: Array) -> Array:
+        """Derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u)`` as those by the inputs ``(N n_u,)``."""
+        n_x = self._n_x
+        return slope[:, :n_x].ravel() @ prepared.from_u[: slope.shape[0] * n_x] + slope[:, n_x:].ravel()
 
     def finish(
         self, prepared: Prepared, estimate: Estimate, reference: Array, limits: Limits | None = None,
@@ -320,7 +380,7 @@ class CondensedController(SplitController):
             z = np.hstack([solution.x, solution.h])
             again = self.linearize(
                 solution.u, z, solution.d, prepared.u_prev, prepared.weight, solution.w, solution.steady,
-                solution.active,
+                solution.active, solution.multipliers,
             )  # fmt: skip
             solution = self.feedback(again, estimate, reference, limits, w)
             total = {name: spent[name] + solution.timing[name] for name in spent}
@@ -332,7 +392,7 @@ class CondensedController(SplitController):
     def condense(
         self, u: Array, z: Array, d: Array, u_prev: Array, weight: Array,
         derivatives: Derivatives, start: float, p: Array | None = None, *, w: Array | None = None,
-        steady: Steady | None = None, active: Active | None = None,
+        steady: Steady | None = None, active: Active | None = None, multipliers: Array | None = None,
     ) -> Prepared:  # fmt: skip
         """Condense derivatives ``(z_next, A_t, B)`` that are known; ``start`` is when the work began.
 
@@ -364,6 +424,7 @@ class CondensedController(SplitController):
         return Prepared(
             u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, self._direct(u.ravel(), u_prev), hessian, weight,
             soft, economic, spent, w, e, steady, active,
+            multipliers,
         )  # fmt: skip
 
     def _of_inputs(self, b: Array, u: Array) -> Array:
