@@ -90,9 +90,11 @@ def _program(function: Any) -> Any:
     from nn_export.program import to_json
 
     try:
-        return to_json(program_of(function))
+        data = to_json(program_of(function))
     except ExportError as error:
         raise InputError(f"an expression cannot be written: {error} [HM-RECORDS-001]") from error
+    data["metadata"] |= {"name": function.name()}
+    return data
 
 
 def record(kind: type[T], data: object, where: str) -> T:
@@ -377,13 +379,17 @@ def _array(value: object) -> Any:
 
 def _built(value: object, where: str, problems: list[str]) -> Any:
     """A CasADi function from its program, in scalar operations."""
+    import casadi
+
     from nn_export import ExportError, build
     from nn_export.program import from_json
 
     if type(value) is _function():
         return value
     try:
-        return build(from_json(value, {}, "program")).expand()
+        program = from_json(value, {}, "program")
+        name = program.metadata.get("name", "")
+        return build(program, name if casadi.Function.check_name(name) else None).expand()
     except ExportError as error:
         problems.append(f"{where}: {error}")
     except RuntimeError as error:  # an operator that CasADi only has for matrices

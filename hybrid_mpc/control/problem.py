@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
@@ -32,6 +32,8 @@ BEYOND = 10.0
 """Widths of a state's declared range that a plan may lie outside of it: further out the model's prediction diverges."""
 USABLE = 0.5
 """Widths beyond its declared range in which a state of a free run may be: there the first linearization still holds."""
+HALVINGS = 30
+"""Halvings of the distance to an admissible input: the rest is 1e-9 of it."""
 KNOTS = 8
 """Most set-points of one preview with a steady state of their own. For a reference that changes all the time, steady
 states are interpolated between so many rows."""
@@ -108,9 +110,12 @@ class Solution:
         """Inputs ``(N, n_u)`` of the plan one period later, with the last one repeated."""
         return np.vstack([self.u[1:], self.u[-1:]])
 
-    def beginning_with(self, u: Array) -> Solution:
-        """The plan with first input ``u`` ``(n_u,)``."""
-        return replace(self, u=np.vstack([u[None], self.u[1:]]))
+    def beginning_with(self, u: Array, given_way: Mapping[str, float] | None = None) -> Solution:
+        """The plan with first input ``u`` ``(n_u,)``, and with further violations of hard bounds."""
+        ways = dict(self.given_way)
+        for name, value in (given_way or {}).items():
+            ways[name] = max(value, ways.get(name, 0.0))
+        return replace(self, u=np.vstack([u[None], self.u[1:]]), given_way=ways)
 
     def delayed(self, u_held: Array) -> Solution:
         """The plan one period earlier, with ``u_held`` ``(n_u,)`` in that period: a solve that shifts it has this plan.
@@ -121,7 +126,13 @@ class Solution:
         c = self.curvature
         c = None if c is None else np.concatenate([c[:1], c[:-1]])
         return replace(
-            self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c, active=None,
+            self,
+            u=np.vstack([u_held[None], self.u[:-1]]),
+            x=x,
+            h=h,
+            w=w,
+            curvature=c,
+            active=None,
             multipliers=None,
         )
 
@@ -153,6 +164,8 @@ class BoundRows:
     """Whether a bounded value depends on ``e``."""
     curved: bool
     """Whether a bounded value is not affine in state and input."""
+    on_inputs: InputBounds
+    """The hard bounds on expressions of the inputs alone."""
 
     def __init__(self, ocp: OCP, model: HybridModel, sizes: Sizes) -> None:
         n = ocp.horizon
@@ -167,8 +180,11 @@ class BoundRows:
         self.states: NDArray[np.int64] = np.concatenate([g.states for g in groups]).astype(np.int64)
         """The bounded states, in the order of a period's rows of them; one may be there twice."""
         self._expressions = [BufferedFunction(_with_slopes(f).map(n)) for f in self.functions]
-        self._curvature = [None if is_affine(f) else BufferedFunction(_curvature(f).map(n)) for f in self.functions]
+        self._curvature = [
+            None if is_affine(f) else BufferedFunction(_curvature(f).map(n)) for f in self.functions
+        ]
         self.curved = any(f is not None for f in self._curvature)
+        self.on_inputs = InputBounds(groups, ocp)
         blocks = [[g for g in groups if g.function is None], *([g] for g in groups if g.function is not None)]
         each = [
             np.hstack([g.rows for g in block]) for block in blocks
@@ -260,6 +276,17 @@ class BoundRows:
                 total += f.outputs[0].reshape(n, size, size)
         return total
 
+    def by_period(self, rows: Array) -> Array:
+        """Numbers of the rows ``(M,)`` of expressions, period by period: ``(N, E)``."""
+        sizes = [self._horizon * f.numel_out(0) for f in self.functions]
+        parts = np.split(rows[self._rows.size :], np.cumsum(sizes)[:-1])
+        return np.hstack([part.reshape(self._horizon, -1) for part in parts])
+
+    def by_row(self, periods: Array) -> Array:
+        """Numbers of expressions ``(N, E)`` as those of all rows ``(M,)``; zero for those of states."""
+        parts = np.split(periods, np.cumsum([f.numel_out(0) for f in self.functions])[:-1], axis=1)
+        return np.concatenate([np.zeros(self._rows.size), *(part.ravel() for part in parts)])
+
     def condensed(
         self, x: Array, u: Array, from_u: Array, e: Array | None = None
     ) -> tuple[Array, Array, Array]:
@@ -312,6 +339,74 @@ class _Bounded:
     states: NDArray[np.int64]
     rows: Array
     names: tuple[str, ...]
+
+
+class InputBounds:
+    """Hard bounds on expressions of inputs alone, which every applied input keeps.
+
+    Args:
+        groups: All bounds of the problem.
+        ocp: The problem.
+    """
+
+    def __init__(self, groups: Sequence[_Bounded], ocp: OCP) -> None:
+        self._ocp = ocp
+        u, values, rows = ca.MX.sym("u", ocp.n_u), [], []
+        self.kinds: list[int] = []
+        """Index of each bound among the bounds of a period, states first."""
+        self.names: tuple[str, ...] = ()
+        at = sum(g.states.size for g in groups)
+        for g in groups:
+            if (f := g.function) is None:
+                continue
+            lower, upper, _, _, hard, at_end, size = g.rows
+            others = np.hstack([ca.DM(f.jac_sparsity(0, i), 1).full() for i in (0, 2)])
+            own = np.flatnonzero((hard > 0) & (at_end == 0) & ~np.any(others, axis=1))
+            if own.size:
+                values.append(f(np.zeros(f.numel_in(0)), u, np.zeros(f.numel_in(2)))[own.tolist()])
+                kept = KEPT * np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), size)[own]
+                rows.append((lower[own] - kept, upper[own] + kept))
+                self.kinds += (at + own).tolist()
+                self.names += tuple(g.names[i] for i in own)
+            at += f.numel_out(0)
+        self.lower: Array
+        self.upper: Array
+        self.lower, self.upper = np.hstack(rows) if rows else np.zeros((2, 0))
+        self.function = ca.Function("bounds_of_inputs", [u], [ca.densify(ca.vertcat(*values))])
+        """``u`` to the bounded values."""
+        finite = np.isfinite(ocp.u_min) & np.isfinite(ocp.u_max)
+        with np.errstate(invalid="ignore"):
+            self.centre: Array = np.where(
+                finite, 0.5 * (ocp.u_min + ocp.u_max), np.clip(0.0, ocp.u_min, ocp.u_max)
+            )
+        """Middle of the inputs' ranges ``(n_u,)``, for an open range the value closest to zero."""
+
+    def given_way(self, u: Array) -> dict[str, float]:
+        """Violations of the input ``u`` ``(n_u,)`` by name."""
+        if not self.names:
+            return {}
+        value = self.function(u).full().ravel()
+        off = np.maximum(value - self.upper, self.lower - value)
+        return {name: float(v) for name, v in zip(self.names, off, strict=True) if not v <= 0}
+
+    def keep(self, u: Array, held: Array, limits: Limits | None = None) -> tuple[Array, dict[str, float]]:
+        """``u`` within the limits (:meth:`OCP.saturate`) and these bounds, and its violations of these bounds before.
+
+        An input that violates a bound moves straight towards the held one until all bounds hold, or towards the middle
+        of the ranges if the held one violates them too. If both do, ``u`` is only saturated.
+        """
+        u = self._ocp.saturate(u, held, limits)
+        if not (way := self.given_way(u)):
+            return u, way
+        for goal in (held, self.centre):
+            inside, beyond = self._ocp.saturate(goal, held, limits), u
+            if self.given_way(inside):
+                continue
+            for _ in range(HALVINGS):
+                middle = 0.5 * (inside + beyond)
+                inside, beyond = (inside, middle) if self.given_way(middle) else (middle, beyond)
+            return inside, way
+        return u, way
 
 
 def _bounded(ocp: OCP, model: HybridModel, sizes: Sizes) -> list[_Bounded]:
@@ -483,7 +578,9 @@ def _curvature(f: ca.Function) -> ca.Function:
     n_x, n_u, n_e = (f.size1_in(i) for i in range(3))
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     z, e, m = kind.sym("z", n_x + n_u), kind.sym("e", n_e), kind.sym("m", f.numel_out(0))
-    both = ca.Function("both", [z, e, m], [ca.hessian(ca.dot(m, f(z[:n_x], z[n_x:], e)), z)[0]], {"cse": True})
+    both = ca.Function(
+        "both", [z, e, m], [ca.hessian(ca.dot(m, f(z[:n_x], z[n_x:], e)), z)[0]], {"cse": True}
+    )
     x, u, e, m = (ca.MX.sym(name, n) for name, n in zip("xuem", (n_x, n_u, n_e, m.numel()), strict=True))
     return ca.Function("curvature", [x, u, e, m], [both(ca.vertcat(x, u), e, m)])
 

@@ -31,10 +31,11 @@ Array = NDArray[np.float64]
 NAN = float("nan")
 GROUP = 10
 """Periods whose second derivatives are condensed in one matrix product."""
-CORRECTIONS = 4
+CORRECTIONS = 8
 """Most QPs of a feedback after the first, each with the bounds linearized at the plan of the one before."""
 STRAIGHT = 1e-6
-"""Violation of a curved bound beyond that of its linearization, over its size, up to which a plan is not corrected."""
+"""Violation of a curved bound beyond that of its linearization, over its size, up to which a plan is not corrected. A
+hard bound that its linearization keeps has no such tolerance."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Prepared:
     ``((N + 1) n_x, N n_u)``, and the cost the ``hessian``; ``weighted`` is it times the state weights, ``direct``
     the gradient of the costs of inputs and changes without targets. ``soft`` is the result of
     :meth:`BoundRows.condensed`, ``economic`` are the first derivatives ``(N, n_x + n_u)`` of the economic stage costs
-    and their convexified second derivatives, or None. ``e`` are further arguments of the bounded values, ``multipliers`` those of
-    the bounds.
+    and their convexified second derivatives, or None. ``e`` are further arguments of the bounded values,
+    ``multipliers`` those of the bounds.
     """
 
     u: Array
@@ -257,7 +258,17 @@ class CondensedController(SplitController):
         start, w = perf_counter(), self.problem.forecast(w, None)
         derivatives = self.stages.at(z[:-1], self.model.acting(u, d, w))
         return self.condense(
-            u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady, active=active, multipliers=multipliers
+            u,
+            z,
+            d,
+            u_prev,
+            weight,
+            derivatives,
+            start,
+            w=w,
+            steady=steady,
+            active=active,
+            multipliers=multipliers,
         )
 
     @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
@@ -293,7 +304,9 @@ class CondensedController(SplitController):
         soft = self._soft_rows(prepared, free, target)
         if not (np.isfinite(gradient).all() and (soft is None or np.isfinite(soft[0]).all())):
             return self._failed(prepared, Status.NOT_FINITE, start)
-        return self._solved(prepared, target, estimate, (hessian, gradient), soft, (free, drift), limits, start)
+        return self._solved(
+            prepared, target, estimate, (hessian, gradient), soft, (free, drift), limits, start
+        )
 
     def _solved(
         self, prepared: Prepared, target: Target, estimate: Estimate, quadratic: tuple[Array, Array],
@@ -311,19 +324,26 @@ class CondensedController(SplitController):
         rows, n_x, best = self.problem.soft, self._n_x, None
         free, drift = run
         lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
-        point, ahead = (prepared.z[:, :n_x], prepared.u), np.hstack([free[:-1, :n_x], np.zeros_like(prepared.u)])
+        point, ahead = (
+            (prepared.z[:, :n_x], prepared.u),
+            np.hstack([free[:-1, :n_x], np.zeros_like(prepared.u)]),
+        )
         multipliers, active = prepared.multipliers, prepared.active
-        for _ in range(1 + CORRECTIONS):
+        left = CORRECTIONS
+        while True:
             hessian, gradient = quadratic
-            if multipliers is not None and multipliers.any():
-                curvature = convex_part(
-                    rows.curvature(*point, multipliers, target.e), self.problem.economic.size
-                )
+            if weighted := multipliers is not None and bool(multipliers.any()):
+                curvature = rows.curvature(*point, multipliers, target.e)
+                curvature[~np.isfinite(curvature).all(axis=(1, 2))] = 0.0
+                curvature = convex_part(curvature, self.problem.economic.size)
                 hessian = hessian + condense_hessians(curvature, prepared.from_u, n_x)
                 gradient = gradient + self._by_inputs(prepared, (curvature @ ahead[:, :, None])[:, :, 0])
             answer = self.qp.solve(
                 hessian, gradient, prepared.u, prepared.u_prev, soft, limits, active, strict=True
             )
+            if not answer.status.ok and best is None and weighted:
+                multipliers = None  # those of the last plan may not fit any more
+                continue
             if not answer.status.ok:
                 return best or self._failed(prepared, answer.status, start, answer.kkt)
             step, inputs = answer.step, answer.step.reshape(prepared.u.shape)
@@ -336,7 +356,10 @@ class CondensedController(SplitController):
                 if rows.curved:
                     value, _, slope = rows.condensed(*point, prepared.from_u, target.e)
                     excess = rows.excess(value)
-                    beyond = float(np.max((excess - rows.excess(linear)) / rows.scale))
+                    straight = rows.excess(linear)
+                    # a hard bound that the QP keeps is kept to the tolerance
+                    allowed = np.where(rows.hard & (straight == 0), 0.0, STRAIGHT)
+                    beyond = float(np.max((excess - straight) / rows.scale - allowed))
                     soft = value - slope @ step, slope
                 else:
                     excess = rows.excess(linear)
@@ -351,11 +374,10 @@ class CondensedController(SplitController):
                     defect=_largest(prepared.defects), timing=self._timing(prepared, start), excess=largest,
                     w=target.w, steady=target.steady, active=active, given_way=given_way, multipliers=multipliers,
                 )  # fmt: skip
-            if beyond <= STRAIGHT:
-                break
+            if not beyond > 0 or soft is None or not left or not np.isfinite(soft[1]).all():
+                return replace(best, timing=self._timing(prepared, start))
+            left -= 1
             ahead = -np.hstack([(prepared.from_u[: n_x * len(u)] @ step).reshape(-1, n_x), inputs])
-        assert best is not None
-        return replace(best, timing=self._timing(prepared, start))
 
     def _by_inputs(self, prepared: Prepared, slope: Array) -> Array:
         """Derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u)`` as those by the inputs ``(N n_u,)``."""

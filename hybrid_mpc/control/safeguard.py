@@ -54,8 +54,9 @@ class SafeController:
     The safe input must be declared: zero may be an unsafe thrust or valve position. Without a safe input the last input
     is held.
 
-    Every input is within ``[u_min, u_max]`` and within ``du_max`` of the last one, whatever solver, model and estimate
-    return. The object has no state: the held input, the plan and its age are in the :class:`Decision`.
+    Every input is within ``[u_min, u_max]``, within ``du_max`` of the last one, and within the hard bounds on inputs
+    alone (:meth:`~hybrid_mpc.control.problem.InputBounds.keep`), whatever solver, model and estimate return. The object
+    has no state: the held input, the plan and its age are in the :class:`Decision`.
 
     Args:
         controller: The controller to guard.
@@ -99,7 +100,7 @@ class SafeController:
         check_part(controller, "controller", "a controller", "model", "ocp", "solve")
         if not isinstance(fallback, HybridModel | None):
             raise InputError(f"fallback: must be a model, got {type(fallback).__name__} [HM-CONTROL-039]")
-        ocp = controller.ocp
+        ocp, self._bounds = controller.ocp, controller.problem.soft.on_inputs
         self.controller, self.max_age, self.fallback = controller, max_age, fallback
         self.safe_input = None if safe_input is None else check_safe_input(safe_input, ocp)
         self._split = controller if isinstance(controller, SplitController) else None
@@ -173,8 +174,8 @@ class SafeController:
             last = previous.solution
             solution = self.controller.solve(last, estimate, reference, weight, limits=limits, **_ahead(w))
         if solution.status.ok:
-            u = self.controller.ocp.saturate(solution.u[0], previous.u, limits)
-            return Decision(u, Source.MPC, solution.beginning_with(u), solution.status, 0)
+            u, way = self._bounds.keep(solution.u[0], previous.u, limits)
+            return Decision(u, Source.MPC, solution.beginning_with(u, way), solution.status, 0)
         return self._without(previous, estimate, reference, solution, limits)
 
     def prepare(self, previous: Decision, weight: Array | None = None) -> Any:
@@ -196,13 +197,13 @@ class SafeController:
         limits: Limits | None,
     ) -> Decision:  # fmt: skip
         """The decision if no solution may be applied; ``solution`` has the shifted plan and the reason."""
-        ocp, held = self.controller.ocp, previous.u
+        held = previous.u
         u, source = self._instead(solution, estimate, reference, previous.age + 1, held)
-        u = ocp.saturate(u, held, limits)
+        u, way = self._bounds.keep(u, held, limits)
         inputs = solution.beginning_with(u).u
         inputs = np.where(np.isfinite(inputs), inputs, u)
         plan = self.controller.initial(estimate, inputs) if estimate.finite else replace(solution, u=inputs)
-        return Decision(u, source, plan, solution.status, previous.age + 1)
+        return Decision(u, source, plan.beginning_with(plan.u[0], way), solution.status, previous.age + 1)
 
     @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def _instead(

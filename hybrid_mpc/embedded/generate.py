@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_mpc.control.ocp import OCP
-from hybrid_mpc.control.problem import KEPT, KNOTS, BoundRows, Problem
+from hybrid_mpc.control.problem import HALVINGS, KEPT, KNOTS, BoundRows, Problem
 from hybrid_mpc.control.qp import BOUND_TOLERANCE, KKT_TOLERANCE
+from hybrid_mpc.control.rti import CORRECTIONS, STRAIGHT
 from hybrid_mpc.control.sizes import Sizes
 from hybrid_mpc.control.targets import Targets
 from hybrid_mpc.embedded.cut import Cut, cut, next_places, reduced
@@ -138,7 +139,8 @@ def make_sources(
     sizes = {
         "NX": model.n_x, "NH": model.n_h, "NU": model.n_u, "NY": model.n_y, "NW": model.n_w, "ND": model.n_d,
         "TRACKED": len(tracked), "N": ocp.horizon, "BLOCKS": starts.size, "SOFT_X": soft.states.size,
-        "SOFT_E": expressions, "MODES": len(modes),
+        "SOFT_E": expressions, "BENT": int(soft.curved), "INPUT_BOUNDS": len(soft.on_inputs.kinds),
+        "HALVINGS": HALVINGS, "CORRECTIONS": CORRECTIONS, "MODES": len(modes),
         "DELAYED": model.delay_states, "CHANGES": int(ocp.du_max is not None), "MAX_AGE": max_age, "FIRST": FIRST,
         "FALLBACK_GAIN": int(fallback is not None), "SAFE_INPUT": int(safe_input is not None),
         "NP": ocp.n_p, "HARD": int(np.any(soft.hard)), "OUTPUT_COST": int(ocp.n_y > 0), "TARGET_KNOTS": KNOTS,
@@ -261,7 +263,7 @@ def _config(sizes: Mapping[str, int], single: bool, names: list[str], watched: W
             ("VIOLATED", "2e-5", active_set.PRIMAL_TOLERANCE), ("LEAST_SHARE", "1.0", active_set.LEAST_SHARE),
             ("ROUNDING", "1e-7", active_set.ROUNDING), ("DEPENDENT", "1e-4", active_set.DEPENDENT),
             ("KKT_TOLERANCE", "2e-3", KKT_TOLERANCE), ("BOUND_TOLERANCE", "1e-3", BOUND_TOLERANCE),
-            ("KEPT", "1e-3", KEPT),
+            ("KEPT", "1e-3", KEPT), ("STRAIGHT", "1e-3", STRAIGHT),
         )
     ]  # fmt: skip
     tolerances += [(f"TARGET_{name}", value[single]) for name, value in SEARCH.items()]
@@ -399,7 +401,18 @@ def _expressions(
             *(f"const real *{name}" for name in "xuwdp"),
             *(f"real *{name}" for name in ("value", "by_x", "by_u")),
         ]
-        add("soft_expressions", arguments, {"x": x, "u": u, "w": w, "d": d, "p": p}, outs)
+        given = {"x": x, "u": u, "w": w, "d": d, "p": p}
+        add("soft_expressions", arguments, given, outs)
+        if soft.curved:
+            m, both = ca.SX.sym("m", value.numel()), ca.vertcat(x, u)
+            curve, n = ca.densify(ca.hessian(ca.dot(m, value), both)[0]), both.numel()
+            add("bounds_values", [*arguments[:5], "real *value"], given, outs[: value.numel()])
+            outs = [(f"curve[{i * n + j}]", curve[i, j]) for i in range(n) for j in range(i + 1)]
+            add("bounds_curvature", [*arguments[:5], "const real *m", "real *curve"], given | {"m": m}, outs)
+    if asked["INPUT_BOUNDS"]:
+        value = scalar_code("controller: hard bounds on inputs", soft.on_inputs.function)(u)
+        outs = [(f"value[{i}]", value[i]) for i in range(value.numel())]
+        add("bounds_of_inputs", ["const real *u", "real *value"], {"u": u}, outs)
     if asked["MODES"] or ocp.n_y:
         y = ca.densify(scalar_code("controller: the output", model.output)(x, u, w, ca.DM(model.p)))
         outs = [(f"y[{i}]", y[i]) for i in range(model.n_y)]
@@ -461,12 +474,15 @@ def _tables(
         "soft_linear": dt * linear * scale, "soft_quadratic": 2 * dt * quadratic * scale**2,
         "safe_input": np.zeros(model.n_u) if safe_input is None else safe_input,
     }  # fmt: skip
+    if soft.on_inputs.kinds:
+        limits = soft.on_inputs
+        reals |= {"input_lower": limits.lower, "input_upper": limits.upper, "input_centre": limits.centre}
     if fallback is not None:
         gain = dare(*ocp.linear_quadratic(fallback))[1]
         reals["gain"] = gain[:, : ocp.n_x + fallback.delay_states]
     if ocp.starts:
         reals |= {"starts": np.array([np.clip(s, ocp.u_min, ocp.u_max).ravel() for s in ocp.starts])}
-    if problem.economic.function is not None:
+    if problem.economic.function is not None or soft.curved:
         reals |= {"cost_size": problem.economic.size}
     if estimator is not None or ocp.n_y:
         c, by_u = (m.full() for m in output_with_jacobian(model)(model.x0, model.u0, model.w)[1:])
@@ -497,6 +513,7 @@ def _tables(
     whole: dict[str, Array | NDArray[np.int64] | NDArray[np.bool_] | list[int]] = {
         "block_of": np.repeat(np.arange(starts.size), lengths), "block_start": starts, "block_length": lengths,
         "soft_state": soft.states, "soft_first": _first_periods(soft, n), "soft_hard": soft.hard[kinds],
+        "input_kind": soft.on_inputs.kinds,
         "target_knots": np.linspace(0, n, KNOTS).astype(int),
     }  # fmt: skip
     text = "".join(table(name, value) for name, value in reals.items())

@@ -37,14 +37,14 @@ const size_t hmpc_places[] = {
   PLACE(plan.cost), PLACE(plan.excess), PLACE(working.kkt), PLACE(linear.largest_defect), PLACE(u), PLACE(status),
   PLACE(source), PLACE(age), PLACE(working.iterations), PLACE(steady.x), PLACE(steady.h), PLACE(steady.u),
   PLACE(steady.y), PLACE(steady.reached), PLACE(steady.steady), PLACE(plan.given_way),
-  PLACE(steady.goal), PLACE(steady.age)
+  PLACE(steady.goal), PLACE(steady.age), PLACE(plan.multiplier)
 };
 """
 """C that exports the offsets of the state's fields."""
 FIELDS = (
     "x", "h", "d", "w", "plan_u", "plan_z", "plan_w", "cost", "excess", "kkt", "defect", "u", "status", "source", "age",
     "iterations", "steady_x", "steady_h", "steady_u", "steady_y", "reached", "steady", "given_way",
-    "steady_goal", "steady_age",
+    "steady_goal", "steady_age", "multiplier",
 )  # fmt: skip
 WHOLE = ("status", "source", "age", "iterations", "reached", "steady", "steady_age")
 
@@ -151,6 +151,7 @@ class NativeController(SplitController):
             w=view["plan_w"][:, :n_w].copy(),
             steady=self._steady() if status.ok else prepared.previous.steady,
             given_way=self._given_way(),
+            multipliers=self._multipliers() if status.ok else None,
         )
 
     def _load(self, plan: Solution) -> None:
@@ -164,6 +165,8 @@ class NativeController(SplitController):
         self._library.c.hmpc_load_plan(self._state.at, *(v.ctypes.data for v in given))
         view, steady = self._state.view, plan.steady
         view["steady"][0], view["steady_age"][0] = steady is not None and steady.steady, WAIT
+        if plan.multipliers is not None and self.problem.soft.curved:
+            view["multiplier"][:] = self.problem.soft.by_period(plan.multipliers)
         if steady is not None:
             view["steady_goal"][:], view["steady_age"][0] = steady.goal, steady.age
             view["steady_x"][:], view["steady_h"][:], view["steady_u"][:] = steady.x, steady.h, steady.u
@@ -175,6 +178,10 @@ class NativeController(SplitController):
             if name and value > 0:
                 found[name] = max(found.get(name, 0.0), value)
         return found
+
+    def _multipliers(self) -> Array | None:
+        soft = self.problem.soft
+        return soft.by_row(self._state.view["multiplier"]) if soft.curved else None
 
     def _steady(self) -> Steady | None:
         """Steady state of the last solve for the first row of the outputs' reference; None without such a reference."""
@@ -221,6 +228,7 @@ class State:
             "steady_x": (n["NX"],), "steady_h": (n["NH"],), "steady_u": (n["NU"],), "steady_y": (n["NY"],),
             "steady_goal": (n["NY"],),
             "given_way": (max(1, n["SOFT_X"] + n["SOFT_E"]),),
+            "multiplier": (max(1, n["BENT"] * n["N"]), max(1, n["SOFT_E"])),
         }  # fmt: skip
         size, *places = library.places
         memory = np.zeros(size + 64, dtype=np.uint8)

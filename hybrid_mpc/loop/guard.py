@@ -272,8 +272,8 @@ class GuardedController:
         """The safe input, approached within ``du_max``."""
         ocp, safe = self.safe.controller.ocp, self.safe.safe_input
         assert safe is not None  # checked when the guard was made
-        u = ocp.saturate(safe, previous.u, limits)
-        plan = replace(previous.solution, u=np.tile(u, (ocp.horizon, 1)))
+        u, way = self.safe.controller.problem.soft.on_inputs.keep(safe, previous.u, limits)
+        plan = replace(previous.solution, u=np.tile(u, (ocp.horizon, 1)), given_way=way)
         return Decision(u, Source.SAFE, plan, Status.INITIAL, 0)
 
 

@@ -119,6 +119,12 @@ typedef struct {
 #if HMPC_STAGE_COST
   hmpc_real cost_slope[HMPC_N][HMPC_NC], cost_curve[HMPC_N][HMPC_NC][HMPC_NC]; /* of nonquadratic costs */
 #endif
+#if HMPC_BENT
+  hmpc_real multiplier[HMPC_N][HMPC_SOFT_E];   /* of the bounded expressions, and their weighted curvature */
+  int bends[HMPC_N];                           /* periods with such a curvature */
+  hmpc_real bend[HMPC_N][HMPC_NC][HMPC_NC], actual[HMPC_N][HMPC_SOFT_E]; /* actual: values along the plan */
+  hmpc_real gradient[HMPC_LD];                 /* of the QP, without that curvature */
+#endif
   hmpc_real largest_defect;
 } hmpc_linear;
 
@@ -127,6 +133,7 @@ typedef struct {
   hmpc_real cost, excess;                   /* excess: largest violation of a soft bound */
   hmpc_real given_way[HMPC_DIM(HMPC_KINDS)]; /* largest violation of each hard bound, 0 if it is kept; hmpc_config.h
                                                 lists their names */
+  hmpc_real multiplier[HMPC_DIM(HMPC_BENT * HMPC_N)][HMPC_DIM(HMPC_SOFT_E)]; /* of curved bounds, if there are any */
 } hmpc_plan;
 
 #if HMPC_OUTPUT_COST
@@ -342,6 +349,7 @@ void hmpc_rates(const hmpc_real *z, const hmpc_real *u, const hmpc_real *w, hmpc
 
 hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linear);
 void hmpc_qp_factor(hmpc_qp *qp);
+void hmpc_qp_multipliers(const hmpc_qp *qp, const hmpc_working *w, hmpc_real *to); /* of the bounded expressions */
 void hmpc_qp_shift(hmpc_working *w);
 #ifndef HMPC_N
 #error "hmpc_config.h lacks the sizes"

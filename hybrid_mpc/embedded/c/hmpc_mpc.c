@@ -51,6 +51,7 @@ void hmpc_run_free(hmpc_state *s, const real *u, int rows) {
   plan->cost = R(NAN);
   plan->excess = R(NAN);
   memset(plan->given_way, 0, sizeof plan->given_way);
+  memset(plan->multiplier, 0, sizeof plan->multiplier);
   s->steady.steady = 0;
   s->steady.age = HMPC_TARGET_WAIT;
   s->prepared = 0;
@@ -62,6 +63,7 @@ void hmpc_load_plan(hmpc_state *s, const real *u, const real *z, const real *d, 
   for (int k = 0; k <= HMPC_N; ++k) memcpy(s->plan.z[k], z + k * HMPC_NZ, sizeof(real) * HMPC_NZ);
   if (HMPC_ND > 0) memcpy(s->plan.d, d, sizeof s->plan.d);
   if (HMPC_NW > 0) memcpy(s->plan.w, w, sizeof s->plan.w);
+  memset(s->plan.multiplier, 0, sizeof s->plan.multiplier);
   s->prepared = 0;
   s->pending = 0;
 }
@@ -112,13 +114,16 @@ static void output_error(const hmpc_state *s, int k, real *error) {
 }
 #endif
 
-#if HMPC_STAGE_COST
-/* Parameters of the general stage cost in period k; cost_y: references of the outputs if outputs are weighted. */
-static const real *cost_p(const hmpc_goal *goal, int k) {
+#if HMPC_STAGE_COST || HMPC_SOFT_E > 0
+/* Parameters of costs and bounds in period k. */
+static const real *goal_p(const hmpc_goal *goal, int k) {
   static const real none[HMPC_DIM(HMPC_NP)];
   return HMPC_NP > 0 && goal && goal->p ? goal->p + (k < goal->rows ? k : goal->rows - 1) * HMPC_NP : none;
 }
+#endif
 
+#if HMPC_STAGE_COST
+/* References of the outputs in period k if outputs are weighted. */
 static const real *cost_y(const hmpc_state *s, int k) {
 #if HMPC_OUTPUT_COST
   return s->target.y[k];
@@ -128,7 +133,9 @@ static const real *cost_y(const hmpc_state *s, int k) {
   return (const real *)0;
 #endif
 }
+#endif
 
+#if HMPC_STAGE_COST || HMPC_BENT
 /* Eigenvalues (diagonal of a on return) and eigenvectors (rows of v) of a symmetric matrix by Jacobi rotations.
    Source: Golub and Van Loan, Matrix Computations, 2013, section 8.5. */
 static void eigen(real (*a)[HMPC_NC], real (*v)[HMPC_NC]) {
@@ -163,23 +170,18 @@ static void eigen(real (*a)[HMPC_NC], real (*v)[HMPC_NC]) {
   }
 }
 
-/* Derivatives of the general stage cost along the plan. Negative eigenvalues of its curvature, scaled by the sizes of
-   states and inputs, are set to zero. */
-static void make_costs(hmpc_state *s, const hmpc_goal *goal) {
-  hmpc_linear *const linear = &s->linear;
-  for (int k = 0; k < HMPC_N; ++k) {
-    real a[HMPC_NC][HMPC_NC], v[HMPC_NC][HMPC_NC], (*const curve)[HMPC_NC] = linear->cost_curve[k];
-    stage_cost_slopes(linear->z[k], linear->u[k], linear->w[k], s->d, cost_p(goal, k), cost_y(s, k),
-                      linear->cost_slope[k], curve[0]);
-    for (int i = 0; i < HMPC_NC; ++i)
-      for (int j = 0; j < HMPC_NC; ++j) a[i][j] = curve[i > j ? i : j][i > j ? j : i] * cost_size[i] * cost_size[j];
-    if (!hmpc_all_finite(a[0], HMPC_NC * HMPC_NC)) continue; /* the QP's numbers are not finite either */
-    eigen(a, v);
-    memset(curve, 0, sizeof linear->cost_curve[k]);
-    for (int e = 0; e < HMPC_NC; ++e)
-      for (int i = 0; i < HMPC_NC && a[e][e] > R(0.0); ++i)
-        for (int j = 0; j < HMPC_NC; ++j) curve[i][j] += a[e][e] * v[e][i] * v[e][j] / (cost_size[i] * cost_size[j]);
-  }
+/* A symmetric matrix, of which the lower triangle is given: negative eigenvalues, scaled by the sizes of states and
+   inputs, are set to zero. */
+static void make_convex(real (*curve)[HMPC_NC]) {
+  real a[HMPC_NC][HMPC_NC], v[HMPC_NC][HMPC_NC];
+  for (int i = 0; i < HMPC_NC; ++i)
+    for (int j = 0; j < HMPC_NC; ++j) a[i][j] = curve[i > j ? i : j][i > j ? j : i] * cost_size[i] * cost_size[j];
+  if (!hmpc_all_finite(a[0], HMPC_NC * HMPC_NC)) return; /* the QP's numbers are not finite either */
+  eigen(a, v);
+  memset(curve, 0, sizeof a);
+  for (int e = 0; e < HMPC_NC; ++e)
+    for (int i = 0; i < HMPC_NC && a[e][e] > R(0.0); ++i)
+      for (int j = 0; j < HMPC_NC; ++j) curve[i][j] += a[e][e] * v[e][i] * v[e][j] / (cost_size[i] * cost_size[j]);
 }
 
 /* Derivatives of state and input of period k by the unknowns. Returns the number of unknowns they depend on. */
@@ -191,13 +193,26 @@ static int stage_rows(const hmpc_linear *linear, int k, real (*rows)[HMPC_LD]) {
   return first + HMPC_NU;
 }
 
-static void add_stage(const hmpc_linear *linear, int k, real (*hessian)[HMPC_LD]) {
+/* Second derivatives by state and input of period k, as those by the unknowns. */
+static void add_stage(const hmpc_linear *linear, int k, const real (*curve)[HMPC_NC], real (*hessian)[HMPC_LD]) {
   real rows[HMPC_NC][HMPC_LD];
   const int m = stage_rows(linear, k, rows);
   for (int i = 0; i < HMPC_NC; ++i) {
     real all[HMPC_LD] = {R(0.0)};
-    for (int j = 0; j < HMPC_NC; ++j) hmpc_add(all, linear->cost_curve[k][i][j], rows[j], m);
+    for (int j = 0; j < HMPC_NC; ++j) hmpc_add(all, curve[i][j], rows[j], m);
     add_product(hessian, R(1.0), rows[i], all, m);
+  }
+}
+#endif
+
+#if HMPC_STAGE_COST
+/* Derivatives of the general stage cost along the plan, with convex second derivatives. */
+static void make_costs(hmpc_state *s, const hmpc_goal *goal) {
+  hmpc_linear *const linear = &s->linear;
+  for (int k = 0; k < HMPC_N; ++k) {
+    stage_cost_slopes(linear->z[k], linear->u[k], linear->w[k], s->d, goal_p(goal, k), cost_y(s, k),
+                      linear->cost_slope[k], linear->cost_curve[k][0]);
+    make_convex(linear->cost_curve[k]);
   }
 }
 
@@ -222,7 +237,11 @@ static void make_hessian(hmpc_state *s) {
         add_product(qp->hessian, factor, linear->from_u[k][i], linear->from_u[k][i], (block_of[k - 1] + 1) * HMPC_NU);
     }
 #if HMPC_STAGE_COST
-  for (int k = 0; k < HMPC_N; ++k) add_stage(linear, k, qp->hessian);
+  for (int k = 0; k < HMPC_N; ++k) add_stage(linear, k, (const real(*)[HMPC_NC])linear->cost_curve[k], qp->hessian);
+#endif
+#if HMPC_BENT
+  for (int k = 0; k < HMPC_N; ++k)
+    if (linear->bends[k]) add_stage(linear, k, (const real(*)[HMPC_NC])linear->bend[k], qp->hessian);
 #endif
 #if HMPC_OUTPUT_ROWS
   for (int k = 0; k < HMPC_N; ++k)
@@ -255,30 +274,34 @@ static void make_hessian(hmpc_state *s) {
 }
 
 #if HMPC_SOFT > 0
+#if HMPC_SOFT_E > 0
+/* Bounded expressions of period k at (x, u), with their derivatives. */
+static void make_expressions(hmpc_state *s, const real *d, const hmpc_goal *goal, int k, const real *x, const real *u) {
+  hmpc_linear *const linear = &s->linear;
+  real value[HMPC_SOFT_E], by_u[HMPC_SOFT_E][HMPC_NU];
+  memset(by_u, 0, sizeof by_u);
+  soft_expressions(x, u, linear->w[k], d, goal_p(goal, k), value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
+  for (int e = 0; e < HMPC_SOFT_E; ++e) {
+    const int row = k * HMPC_SOFT_E + e;
+    real *const slope = s->qp.slope[row];
+    linear->soft[HMPC_N * HMPC_SOFT_X + row] = value[e];
+    memset(slope, 0, sizeof(real) * HMPC_LD);
+    for (int i = 0; i < HMPC_NX; ++i) hmpc_add(slope, linear->by_x[row][i], linear->from_u[k][i], HMPC_NV);
+    for (int j = 0; j < HMPC_NU; ++j) slope[block_of[k] * HMPC_NU + j] += by_u[e][j] * u_scale[j];
+  }
+}
+#endif
+
 /* Soft and hard bounds along the plan. Bounds of outputs depend on the disturbances d, bounds with parameters on the
    goal. */
 static void make_soft(hmpc_state *s, const real *d, const hmpc_goal *goal) {
   hmpc_linear *const linear = &s->linear;
-#if HMPC_SOFT_E > 0
-  static const real none[HMPC_DIM(HMPC_NP)];
-#endif
   for (int k = 0; k < HMPC_N; ++k) {
 #if HMPC_SOFT_X > 0
     for (int i = 0; i < HMPC_SOFT_X; ++i) linear->soft[k * HMPC_SOFT_X + i] = linear->z[k + 1][soft_state[i]];
 #endif
 #if HMPC_SOFT_E > 0
-    real value[HMPC_SOFT_E], by_u[HMPC_SOFT_E][HMPC_NU];
-    const real *const p = goal && goal->p ? goal->p + (k < goal->rows ? k : goal->rows - 1) * HMPC_NP : none;
-    memset(by_u, 0, sizeof by_u);
-    soft_expressions(linear->z[k], linear->u[k], linear->w[k], d, p, value, linear->by_x[k * HMPC_SOFT_E], by_u[0]);
-    for (int e = 0; e < HMPC_SOFT_E; ++e) {
-      const int row = k * HMPC_SOFT_E + e;
-      real *const slope = s->qp.slope[row];
-      linear->soft[HMPC_N * HMPC_SOFT_X + row] = value[e];
-      memset(slope, 0, sizeof(real) * HMPC_LD);
-      for (int i = 0; i < HMPC_NX; ++i) hmpc_add(slope, linear->by_x[row][i], linear->from_u[k][i], HMPC_NV);
-      for (int j = 0; j < HMPC_NU; ++j) slope[block_of[k] * HMPC_NU + j] += by_u[e][j] * u_scale[j];
-    }
+    make_expressions(s, d, goal, k, linear->z[k], linear->u[k]);
 #endif
   }
   (void)d;
@@ -316,6 +339,9 @@ static void linearize(hmpc_state *s, int append) {
     }
   }
   condense(s);
+#if HMPC_BENT
+  memset(linear->bends, 0, sizeof linear->bends);
+#endif
 #if HMPC_STAGE_COST && !HMPC_COST_MOVES
   make_costs(s, (const hmpc_goal *)0);
 #endif
@@ -330,6 +356,9 @@ static void linearize(hmpc_state *s, int append) {
 
 void hmpc_linearize(hmpc_state *s, const hmpc_goal *goal) {
   set_weights(&s->linear, goal);
+#if HMPC_BENT
+  memset(s->linear.multiplier, 0, sizeof s->linear.multiplier);
+#endif
   linearize(s, 0);
 }
 
@@ -342,6 +371,9 @@ void hmpc_prepare(hmpc_state *s, const hmpc_goal *goal) {
     memcpy(linear->u[k], plan->u[next], sizeof linear->u[k]);
     memcpy(linear->z[k], plan->z[k + 1], sizeof linear->z[k]);
     memcpy(linear->w[k], plan->w[k + 1 < HMPC_N ? k + 1 : HMPC_N - 1], sizeof linear->w[k]);
+#if HMPC_BENT
+    memcpy(linear->multiplier[k], plan->multiplier[k + 1 < HMPC_N ? k + 1 : HMPC_N - 1], sizeof linear->multiplier[k]);
+#endif
   }
   memcpy(linear->d, plan->d, sizeof linear->d);
   memcpy(linear->u_prev, plan->u[0], sizeof linear->u_prev);
@@ -442,14 +474,78 @@ static void set_soft(hmpc_state *s) {
 #endif
 }
 
+#if HMPC_BENT
+/* State of period k of the plan with a step of the unknowns. */
+static void state_at(const hmpc_state *s, const real *step, int k, real *x) {
+  for (int i = 0; i < HMPC_NX; ++i)
+    x[i] = s->linear.z[k][i] + s->dz[k][i] + hmpc_dot(s->linear.from_u[k][i], step, HMPC_NV);
+}
+
+/* Adds the curvature of the bounds, weighted with their multipliers, to Hessian and gradient of the QP (sequential
+   convex quadratic programming). step: the curvature at s->plan, which has this step; NULL: at the linearization.
+   Source: Verschueren, van Duijkeren, Quirynen, Diehl, CDC 2016. */
+static void bend(hmpc_state *s, const hmpc_goal *goal, const real *step) {
+  hmpc_linear *const linear = &s->linear;
+  hmpc_qp *const qp = &s->qp;
+  int changed = step != 0;
+  for (int k = 0; k < HMPC_N; ++k) {
+    real x[HMPC_NX];
+    changed |= linear->bends[k];
+    linear->bends[k] = 0;
+    for (int e = 0; e < HMPC_SOFT_E; ++e)
+      linear->bends[k] |= linear->multiplier[k][e] < R(0.0) || linear->multiplier[k][e] > R(0.0);
+    if (!linear->bends[k]) continue;
+    changed = 1;
+    if (step) state_at(s, step, k, x);
+    bounds_curvature(step ? x : linear->z[k], step ? s->plan.u[k] : linear->u[k], linear->w[k], s->d, goal_p(goal, k),
+                     linear->multiplier[k], linear->bend[k][0]);
+    linear->bends[k] = hmpc_all_finite(linear->bend[k][0], HMPC_NC * HMPC_NC);
+    if (linear->bends[k]) make_convex(linear->bend[k]);
+  }
+  if (changed) make_hessian(s);
+  memcpy(qp->gradient, linear->gradient, sizeof qp->gradient);
+  for (int k = 0; k < HMPC_N; ++k) {
+    real rows[HMPC_NC][HMPC_LD], ahead[HMPC_NC] = {R(0.0)}; /* from the point of the curvature to the plan without step */
+    if (!linear->bends[k]) continue;
+    const int m = stage_rows(linear, k, rows);
+    for (int i = 0; i < HMPC_NC && step; ++i) ahead[i] = -hmpc_dot(rows[i], step, m);
+    for (int i = 0; i < HMPC_NX && !step; ++i) ahead[i] = s->dz[k][i];
+    for (int i = 0; i < HMPC_NC; ++i) hmpc_add(qp->gradient, hmpc_dot(linear->bend[k][i], ahead, HMPC_NC), rows[i], m);
+  }
+  for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
+}
+
+/* Linearizes the bounded expressions anew at s->plan, which has this step. */
+static void straighten(hmpc_state *s, const hmpc_goal *goal, const real *step) {
+  for (int k = 0; k < HMPC_N; ++k) {
+    real x[HMPC_NX];
+    state_at(s, step, k, x);
+    make_expressions(s, s->d, goal, k, x, s->plan.u[k]);
+    for (int e = 0; e < HMPC_SOFT_E; ++e) {
+      const int row = k * HMPC_SOFT_E + e, place = HMPC_N * HMPC_SOFT_X + row;
+      s->qp.value[place] = s->linear.soft[place] - hmpc_dot(s->qp.slope[row], step, HMPC_NV);
+    }
+  }
+}
+#endif
+
 /* Reference of an input: that of the set-point's steady state, else the operating point's. */
 static real input_goal(const real *u_goal, int period, int input) {
   return u_goal ? u_goal[period * HMPC_NU + input] : u_rest[input];
 }
 
-/* Cost of the prepared plan with the step qp.step, and its largest violations of soft and of hard bounds. 0 if its
-   states diverge: x_reach holds ten widths beyond their declared ranges. */
-static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int rows, const real *u_goal) {
+#if HMPC_SOFT > 0
+static real violation(int kind, real value) {
+  const real beyond = hmpc_max(value - soft_upper[kind], soft_lower[kind] - value);
+  return hmpc_max(R(0.0), beyond - (soft_hard[kind] ? HMPC_KEPT * soft_scale[kind] : R(0.0)));
+}
+#endif
+
+/* Cost of the prepared plan with the step qp.step and the inputs s->plan.u, and its largest violations of soft and of
+   hard bounds. bent: largest violation of a bound beyond that of its linearization, over its size and beyond the
+   tolerance. 0 if its states
+   diverge: x_reach holds ten widths beyond their declared ranges. */
+static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int rows, const real *u_goal, real *bent) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
   real total = R(0.0), error[HMPC_NX], before[HMPC_NU];
@@ -467,7 +563,7 @@ static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int
     real x[HMPC_NX], acts[HMPC_NU], cost;
     for (int i = 0; i < HMPC_NX; ++i) x[i] = error[i] + goal[i];
     for (int j = 0; j < HMPC_NU; ++j) acts[j] = linear->u[k][j] + step[block_of[k] * HMPC_NU + j] * u_scale[j];
-    stage_cost(x, acts, linear->w[k], s->d, cost_p(goals, k), cost_y(s, k), &cost);
+    stage_cost(x, acts, linear->w[k], s->d, goal_p(goals, k), cost_y(s, k), &cost);
     total += cost;
 #endif
     for (int i = 0; i < HMPC_NX; ++i) total += linear->weight[k][i] * q_x[i] * error[i] * error[i];
@@ -493,6 +589,14 @@ static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int
   }
 #endif
   real excess = R(0.0);
+  *bent = R(0.0);
+#if HMPC_BENT
+  for (int k = 0; k < HMPC_N; ++k) {
+    real x[HMPC_NX];
+    state_at(s, step, k, x);
+    bounds_values(x, s->plan.u[k], linear->w[k], s->d, goal_p(goals, k), s->linear.actual[k]);
+  }
+#endif
   memset(s->plan.given_way, 0, sizeof s->plan.given_way);
 #if HMPC_SOFT > 0
   for (int row = 0; row < HMPC_SOFT; ++row) {
@@ -515,8 +619,15 @@ static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int
     }
     if (period < soft_first[kind]) continue;
     const real value = s->qp.value[row] + hmpc_dot(slope, step, HMPC_NV);
-    const real beyond = hmpc_max(value - soft_upper[kind], soft_lower[kind] - value);
-    const real over = hmpc_max(R(0.0), beyond - (soft_hard[kind] ? HMPC_KEPT * soft_scale[kind] : R(0.0)));
+    real over = violation(kind, value);
+#if HMPC_BENT
+    if (!states) {
+      const real straight = over;
+      over = violation(kind, linear->actual[period][kind - HMPC_SOFT_X]);
+      const int kept = soft_hard[kind] && !(straight > R(0.0)); /* a hard bound that the QP keeps */
+      *bent = hmpc_max(*bent, (over - straight) / soft_scale[kind] - (kept ? R(0.0) : HMPC_STRAIGHT));
+    }
+#endif
     if (soft_hard[kind]) {
       s->plan.given_way[kind] = hmpc_max(s->plan.given_way[kind], over);
     } else {
@@ -540,6 +651,7 @@ static hmpc_status failed(hmpc_state *s, hmpc_status status) {
   s->plan.cost = R(NAN);
   s->plan.excess = R(NAN);
   memset(s->plan.given_way, 0, sizeof s->plan.given_way);
+  memset(s->plan.multiplier, 0, sizeof s->plan.multiplier);
   s->pending = 0;
   s->working.count = 0;
   return s->status = status;
@@ -634,7 +746,12 @@ static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows
       qp->gradient[i] +=
           R(2.0) * (r_u[j] * (u - goal_u) + r_delta[j] * ((u - before) - (after - u))) * u_scale[j];
     }
+#if HMPC_BENT
+  memcpy(linear->gradient, qp->gradient, sizeof linear->gradient);
+  bend(s, goal, (const real *)0);
+#else
   for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
+#endif
 #if HMPC_SOFT > 0 && (HMPC_SOFT_D || HMPC_NP > 0)
   if (HMPC_NP > 0 || memcmp(linear->d, s->d, sizeof linear->d) != 0) make_soft(s, s->d, goal);
 #endif
@@ -646,24 +763,74 @@ static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows
   return fine;
 }
 
-/* Solves the prepared plan for the estimate and the goal; near: 0 if its states diverge. */
-static hmpc_status solve_plan(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows, int *near) {
+/* Inputs of the plan: those of the linearization with the QP's step. */
+static void take_step(hmpc_state *s, const hmpc_goal *goal) {
   const hmpc_linear *const linear = &s->linear;
-  const hmpc_qp *const qp = &s->qp;
-  drawn_to to;
-  if (!s->prepared) hmpc_prepare(s, goal);
-  if (!embed(s, goal, w, w_rows, &to)) return failed(s, HMPC_NOT_FINITE);
-  const hmpc_status status = hmpc_qp_solve(&s->qp, &s->working, linear);
-  if (status != HMPC_SOLVED) return failed(s, status);
-  *near = assess(s, goal, to.x, to.rows, to.u);
-  if (!hmpc_finite(s->plan.cost)) return failed(s, HMPC_NOT_FINITE);
   for (int k = 0; k < HMPC_N; ++k) {
     real low[HMPC_NU], high[HMPC_NU];
     limits_of(goal, linear->u_prev, block_of[k], low, high);
     for (int j = 0; j < HMPC_NU; ++j)
       s->plan.u[k][j] =
-          hmpc_clip(linear->u[k][j] + qp->step[block_of[k] * HMPC_NU + j] * u_scale[j], low[j], high[j]);
+          hmpc_clip(linear->u[k][j] + s->qp.step[block_of[k] * HMPC_NU + j] * u_scale[j], low[j], high[j]);
   }
+}
+
+/* Solves the prepared plan for the estimate and the goal; near: 0 if its states diverge. If the plan violates a curved
+   bound more than its linearization, the bounds are linearized again at the plan; the cheapest plan counts. */
+static hmpc_status solve_plan(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows, int *near) {
+  const hmpc_linear *const linear = &s->linear;
+  drawn_to to;
+  real bent;
+  if (!s->prepared) hmpc_prepare(s, goal);
+  if (!embed(s, goal, w, w_rows, &to)) return failed(s, HMPC_NOT_FINITE);
+  hmpc_status status = hmpc_qp_solve(&s->qp, &s->working, linear);
+#if HMPC_BENT
+  int weighted = 0;
+  for (int k = 0; k < HMPC_N; ++k) weighted |= linear->bends[k];
+  if (status != HMPC_SOLVED && weighted) { /* the multipliers of the last plan may not fit any more */
+    memset(s->linear.multiplier, 0, sizeof s->linear.multiplier);
+    s->working.count = 0;
+    bend(s, goal, (const real *)0);
+    status = hmpc_qp_solve(&s->qp, &s->working, linear);
+  }
+#endif
+  if (status != HMPC_SOLVED) return failed(s, status);
+  take_step(s, goal);
+  *near = assess(s, goal, to.x, to.rows, to.u, &bent);
+  if (!hmpc_finite(s->plan.cost)) return failed(s, HMPC_NOT_FINITE);
+#if HMPC_BENT
+  real best[HMPC_LD], least = s->plan.cost, kkt = s->working.kkt;
+  const int corrected = bent > R(0.0);
+  memcpy(best, s->qp.step, sizeof best);
+  hmpc_qp_multipliers(&s->qp, &s->working, s->plan.multiplier[0]);
+  memcpy(s->linear.multiplier, s->plan.multiplier, sizeof s->linear.multiplier);
+  for (int again = 0; again < HMPC_CORRECTIONS && bent > R(0.0); ++again) {
+    real step[HMPC_LD];
+    memcpy(step, s->qp.step, sizeof step);
+    bend(s, goal, step);
+    straighten(s, goal, step);
+    status = hmpc_qp_solve(&s->qp, &s->working, linear);
+    if (status != HMPC_SOLVED) {
+      s->working.count = 0;
+      break;
+    }
+    take_step(s, goal);
+    (void)assess(s, goal, to.x, to.rows, to.u, &bent);
+    if (!hmpc_finite(s->plan.cost)) break;
+    hmpc_qp_multipliers(&s->qp, &s->working, s->linear.multiplier[0]);
+    if (!(s->plan.cost < least)) continue;
+    least = s->plan.cost;
+    kkt = s->working.kkt;
+    memcpy(best, s->qp.step, sizeof best);
+    memcpy(s->plan.multiplier, s->linear.multiplier, sizeof s->plan.multiplier);
+  }
+  if (corrected) { /* the plan is the cheapest one */
+    memcpy(s->qp.step, best, sizeof best);
+    s->working.kkt = kkt;
+    take_step(s, goal);
+    *near = assess(s, goal, to.x, to.rows, to.u, &bent);
+  }
+#endif
   memcpy(s->plan.w, linear->w, sizeof s->plan.w);
 #if HMPC_OUTPUT_COST
   s->steady = s->aimed;
@@ -687,6 +854,41 @@ static void saturate(const hmpc_goal *goal, const real *u, const real *held, rea
     const real near = HMPC_CHANGES ? hmpc_clip(u[i], held[i] - du_max[i], held[i] + du_max[i]) : u[i];
     to[i] = hmpc_clip(near, low[i], high[i]);
   }
+}
+
+#if HMPC_INPUT_BOUNDS > 0
+/* Whether u keeps the hard bounds on inputs alone; way: its violations are entered there, unless NULL. */
+static int admissible(const real *u, real *way) {
+  real value[HMPC_INPUT_BOUNDS];
+  int kept = 1;
+  bounds_of_inputs(u, value);
+  for (int i = 0; i < HMPC_INPUT_BOUNDS; ++i) {
+    const real off = hmpc_max(value[i] - input_upper[i], input_lower[i] - value[i]);
+    if (off <= R(0.0)) continue;
+    kept = 0;
+    if (way) way[input_kind[i]] = hmpc_max(way[input_kind[i]], off);
+  }
+  return kept;
+}
+#endif
+
+/* Sets s->u to u within the limits and the hard bounds on inputs alone: it moves towards the held input, or towards the
+   middle of the ranges, until the bounds hold. Its violations before are entered in given_way. */
+static void apply(hmpc_state *s, const hmpc_goal *goal, const real *u, const real *held) {
+  saturate(goal, u, held, s->u);
+#if HMPC_INPUT_BOUNDS > 0
+  real inside[HMPC_NU], beyond[HMPC_NU], middle[HMPC_NU];
+  if (admissible(s->u, s->plan.given_way)) return;
+  saturate(goal, held, held, inside);
+  if (!admissible(inside, (real *)0)) saturate(goal, input_centre, held, inside);
+  if (!admissible(inside, (real *)0)) return;
+  memcpy(beyond, s->u, sizeof beyond);
+  for (int n = 0; n < HMPC_HALVINGS; ++n) {
+    for (int i = 0; i < HMPC_NU; ++i) middle[i] = R(0.5) * (inside[i] + beyond[i]);
+    memcpy(admissible(middle, (real *)0) ? inside : beyond, middle, sizeof middle);
+  }
+  memcpy(s->u, inside, sizeof s->u);
+#endif
 }
 
 /* Stabilising feedback of the prior around the steady state closest to the goal; 0 if it is not finite. */
@@ -732,7 +934,7 @@ static int fallback(hmpc_state *s, const hmpc_goal *goal, real *u) {
 /* Input and plan without a valid solution: the input of the shifted plan if follow, else of the fallback, else the safe
    input, or the held one if no safe input is declared. */
 static void without(hmpc_state *s, const hmpc_goal *goal, const real *held, int follow) {
-  real u[HMPC_NU];
+  real u[HMPC_NU], way[HMPC_DIM(HMPC_KINDS)];
   const int known = hmpc_all_finite(s->x, HMPC_NX) && hmpc_all_finite(s->h, HMPC_NH) &&
                     hmpc_all_finite(s->d, HMPC_ND) && hmpc_all_finite(s->w, HMPC_NW);
   if (follow && hmpc_all_finite(s->plan.u[0], HMPC_NU)) {
@@ -744,7 +946,9 @@ static void without(hmpc_state *s, const hmpc_goal *goal, const real *held, int 
     s->source = HMPC_SAFE_INPUT ? HMPC_SAFE : HMPC_HELD;
     memcpy(u, HMPC_SAFE_INPUT ? safe_input : held, sizeof u);
   }
-  saturate(goal, u, held, s->u);
+  memset(s->plan.given_way, 0, sizeof s->plan.given_way);
+  apply(s, goal, u, held);
+  memcpy(way, s->plan.given_way, sizeof way);
   memcpy(s->plan.u[0], s->u, sizeof s->u);
   for (int k = 0; k < HMPC_N; ++k)
     for (int i = 0; i < HMPC_NU; ++i)
@@ -753,6 +957,7 @@ static void without(hmpc_state *s, const hmpc_goal *goal, const real *held, int 
     real inputs[HMPC_N][HMPC_NU];
     memcpy(inputs, s->plan.u, sizeof inputs);
     hmpc_run_free(s, inputs[0], HMPC_N);
+    memcpy(s->plan.given_way, way, sizeof way);
   }
 }
 
@@ -766,7 +971,7 @@ void hmpc_decide(hmpc_state *s, const hmpc_goal *goal, const real *applied) {
   }
   const hmpc_status status = hmpc_feedback(s, goal, (const real *)0, 0);
   if (status == HMPC_SOLVED) {
-    saturate(goal, s->plan.u[0], held, s->u);
+    apply(s, goal, s->plan.u[0], held);
     memcpy(s->plan.u[0], s->u, sizeof s->u);
     s->source = HMPC_MPC;
     s->age = 0;
@@ -782,6 +987,7 @@ void hmpc_fall_back(hmpc_state *s, const hmpc_goal *goal, const real *held) {
   s->plan.cost = R(NAN);
   s->plan.excess = R(NAN);
   memset(s->plan.given_way, 0, sizeof s->plan.given_way);
+  memset(s->plan.multiplier, 0, sizeof s->plan.multiplier);
   s->working.count = 0;
   s->prepared = 0;
   without(s, goal, held, 0);
@@ -790,7 +996,8 @@ void hmpc_fall_back(hmpc_state *s, const hmpc_goal *goal, const real *held) {
 }
 
 void hmpc_rest(hmpc_state *s, const hmpc_goal *goal, const real *held) {
-  saturate(goal, safe_input, held, s->u);
+  memset(s->plan.given_way, 0, sizeof s->plan.given_way);
+  apply(s, goal, safe_input, held);
   for (int k = 0; k < HMPC_N; ++k) memcpy(s->plan.u[k], s->u, sizeof s->u);
   s->prepared = 0;
   s->pending = 0;
@@ -803,6 +1010,7 @@ void hmpc_rest(hmpc_state *s, const hmpc_goal *goal, const real *held) {
 static void delay_plan(hmpc_state *s, const real *held) {
   memmove(s->plan.z + 1, s->plan.z, sizeof s->plan.z - sizeof s->plan.z[0]);
   memmove(s->plan.u + 1, s->plan.u, sizeof s->plan.u - sizeof s->plan.u[0]);
+  memmove(s->plan.multiplier + 1, s->plan.multiplier, sizeof s->plan.multiplier - sizeof s->plan.multiplier[0]);
   memcpy(s->plan.u[0], held, sizeof s->plan.u[0]);
   s->prepared = 0;
 }
@@ -849,6 +1057,7 @@ static int iterate(hmpc_state *s, const hmpc_goal *goal, const real *u, int rows
 static real cost_of_run(hmpc_state *s, const hmpc_goal *goal, const real *u) {
   hmpc_linear *const linear = &s->linear;
   drawn_to to;
+  real bent;
   hmpc_run_free(s, u, HMPC_N);
   memcpy(linear->u, s->plan.u, sizeof linear->u);
   memcpy(linear->z, s->plan.z, sizeof linear->z);
@@ -858,7 +1067,7 @@ static real cost_of_run(hmpc_state *s, const hmpc_goal *goal, const real *u) {
   hmpc_linearize(s, goal);
   if (!embed(s, goal, (const real *)0, 0, &to)) return R(INFINITY);
   memset(s->qp.step, 0, sizeof s->qp.step);
-  assess(s, goal, to.x, to.rows, to.u);
+  assess(s, goal, to.x, to.rows, to.u, &bent);
   return hmpc_finite(s->plan.cost) ? s->plan.cost : R(INFINITY);
 }
 #endif

@@ -522,6 +522,17 @@ hmpc_status hmpc_qp_solve(hmpc_qp *qp, hmpc_working *w, const hmpc_linear *linea
   return status;
 }
 
+#if HMPC_BENT
+void hmpc_qp_multipliers(const hmpc_qp *qp, const hmpc_working *w, real *to) {
+  memset(to, 0, sizeof(real) * HMPC_N * HMPC_SOFT_E);
+  for (int k = 0; k < w->count; ++k) {
+    const int row = soft_of(w->id[k]);
+    if (row < SOFT_STATES) continue;
+    to[row - SOFT_STATES] = (w->id[k] < SOFT_LOWER ? qp->size : -qp->size) * w->multiplier[k] / soft_scale[soft_kind(row)];
+  }
+}
+#endif
+
 /* Shifts the working set by one period. */
 void hmpc_qp_shift(hmpc_working *w) {
   int n = 0;
