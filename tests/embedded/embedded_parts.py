@@ -155,6 +155,15 @@ def cart(hard, *, delay=0.0, horizon=25, **options):
     return model, OCP(horizon, [10.0, 0.1], [0.01], [0.0], [-3.0], [3.0], hard=hard, **options)
 
 
+def circle():
+    """A point that is driven along a plane, at a speed of at most 1 m/s in any direction."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    place, speeds = tuple(Signal(n, "m") for n in "ab"), tuple(Signal(f"v{n}", "m/s") for n in "ab")
+    model = HybridModel.of("point", 0.1, place, speeds, place, x=x, u=u, x_next=x + 0.1 * u, xdot=u, y=x)
+    speed = HardBound(ca.Function("speed", [x, u], [ca.sumsqr(u)]), [-np.inf], [1.0])
+    return model, OCP(15, [1.0] * 2, [0.0] * 2, [0.01] * 2, [-1.0] * 2, [1.0] * 2, hard=[speed])
+
+
 def ways_round():
     """A point that is driven along a plane round a hill: the way that a plan finds by itself costs more."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from embedded_parts import needs_compiler
 
-from hybrid_mpc import CondensedController, HardBound, SoftBound, TrueState
+from hybrid_mpc import (
+    CondensedController,
+    ExtendedKalmanFilter,
+    HardBound,
+    SafeController,
+    SoftBound,
+    TrueState,
+)
+from hybrid_mpc.control.safeguard import Source
 from hybrid_mpc.embedded.native import NativeController
 
 pytestmark = needs_compiler
@@ -98,6 +106,34 @@ def test_bounds_are_kept_and_give_way_as_in_python(name):
         plan = wanted
     assert seen["active"] > 30, seen
     assert min(seen.values()) > 3, seen
+
+
+@pytest.mark.parametrize("limited", [False, True])
+def test_applied_inputs_keep_bounds_of_inputs_as_in_python(limited):
+    """The shifted plan, then the fallback; both begin at the corner of the box, outside of the circle."""
+    model, ocp = parts.circle()
+    ocp = ocp.changed(du_max=[0.3, 0.3]) if limited else ocp
+    estimator = ExtendedKalmanFilter(model, sigma_y=[1e-3] * 2, sigma_x=[1e-3] * 2, sigma_x0=[0.1] * 2)
+    c = parts.CLoop(model, ocp, estimator, fallback=model, safe_input=np.zeros(2))
+    safe = SafeController(CondensedController(model, ocp), fallback=model, safe_input=[0.0, 0.0])
+    estimate = TrueState(model).start([-9.0, -8.0])
+    first = safe.initial(estimate)
+    decision = replace(first, solution=replace(first.solution, u=np.vstack([[[0.0, 0.0]], np.ones((14, 2))])))
+    view, plan = c.state.view, decision.solution
+    c.call("load_plan", plan.u, np.hstack([plan.x, plan.h]), plan.d, np.zeros(1))
+    view["u"][:], seen = decision.u, set()
+    for k in range(8):
+        view["x"][:] = estimate.x
+        rows = np.full((1, 2), np.nan)
+        decision = safe.decide(decision, estimate, rows)
+        c.call("decide", parts.goal(rows, ocp=ocp), None)
+        np.testing.assert_allclose(c.u, decision.u, atol=1e-9, err_msg=str(k))
+        assert c.source == decision.source.name, k
+        assert np.sum(c.u**2) < 1 + 2e-7, k  # the tolerance of hard bounds
+        # the only bound
+        assert c.given_way[0] == pytest.approx(decision.solution.given_way.get("speed", 0.0), abs=1e-9), k
+        seen.add((decision.source, bool(decision.solution.given_way)))
+    assert {(Source.PLAN, True), (Source.FALLBACK, True)} <= seen
 
 
 def test_the_names_are_in_the_generated_files():

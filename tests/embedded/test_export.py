@@ -44,6 +44,7 @@ MACHINES = {
     "coupled": parts.coupled, "tanks": parts.tanks, "delayed": parts.delayed, "heaters": parts.heaters,
     "bounded": parts.bounded, "band": parts.band, "cart": lambda: parts.cart([AWAY]),
     "curved": parts.curved, "priced": parts.priced, "priced outputs": parts.priced_outputs, "spare": parts.spare,
+    "circle": parts.circle,
     "ways": lambda: several(*parts.ways_round()),
 }  # fmt: skip
 
