@@ -82,7 +82,8 @@ class Solution:
         steady: The steady state for the first row of an outputs' reference; None if references are the states'.
         active: Active rows of the QP, the warm start of the next solve. None: cold start.
         given_way: Hard bounds that the plan violates: largest violation by name. A state has its name in the model, an
-            output is ``output`` and its name, an expression has its function's name.
+            output is ``output`` and its name, an expression has its function's name. Of a decision also the violations
+            of hard bounds on inputs before the input was moved (:meth:`InputBounds.keep`).
         multipliers: Multipliers ``(M,)`` of the bounds [cost per unit], by which the next real-time iteration weighs
             the curvature of the bounds. None: zero.
     """

@@ -385,8 +385,7 @@ class RunReport:
         timing_ms: Durations ``(n,)`` [ms]: ``measure``, ``estimate``, ``solve``, ``actuate``, ``monitor``, ``prepare``.
         alarm: ``(n,)``, True while the monitor alarms.
         switches: Changes of the guard's mode in the whole run. Default: none.
-        given_way: For each period the relaxed hard bounds, because no plan keeps all of them, with the largest
-            violation in the plan. Default: unknown.
+        given_way: For each period the hard bounds that the plan violates, with the largest violation. Default: unknown.
     """
 
     periods: int

@@ -328,8 +328,8 @@ class ClosedLoopResult:
             unknown.
         reached: ``(n,)``, False if the set-point cannot be reached, or is outside the declared range of its signal.
             Default: unknown.
-        given_way: For each period the relaxed hard bounds, because no plan keeps all of them: largest violation in the
-            plan by name, as in :class:`~hybrid_mpc.control.problem.Solution`. Default: unknown.
+        given_way: For each period the hard bounds that the plan violates: largest violation by name, as in
+            :class:`~hybrid_mpc.control.problem.Solution`. Default: unknown.
 
     Example:
         >>> one = np.ones((2, 1))
