@@ -258,18 +258,8 @@ class CondensedController(SplitController):
         start, w = perf_counter(), self.problem.forecast(w, None)
         derivatives = self.stages.at(z[:-1], self.model.acting(u, d, w))
         return self.condense(
-            u,
-            z,
-            d,
-            u_prev,
-            weight,
-            derivatives,
-            start,
-            w=w,
-            steady=steady,
-            active=active,
-            multipliers=multipliers,
-        )
+            u, z, d, u_prev, weight, derivatives, start, w=w, steady=steady, active=active, multipliers=multipliers
+        )  # fmt: skip
 
     @np.errstate(over="ignore", invalid="ignore")  # an overflow is checked and refused
     def feedback(
@@ -324,10 +314,10 @@ class CondensedController(SplitController):
         rows, n_x, best = self.problem.soft, self._n_x, None
         free, drift = run
         lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
-        point, ahead = (
-            (prepared.z[:, :n_x], prepared.u),
-            np.hstack([free[:-1, :n_x], np.zeros_like(prepared.u)]),
-        )
+        point = prepared.z[:, :n_x], prepared.u
+        ahead = np.hstack(
+            [free[:-1, :n_x], np.zeros_like(prepared.u)]
+        )  # from there to the plan without a step
         multipliers, active = prepared.multipliers, prepared.active
         left = CORRECTIONS
         while True:
@@ -352,17 +342,12 @@ class CondensedController(SplitController):
             u = np.minimum(np.maximum(prepared.u + inputs, lower), upper)
             point, excess, largest, given_way, beyond = (z[:, :n_x], u), None, 0.0, {}, 0.0
             if soft is not None:
-                linear = soft[0] + soft[1] @ step
+                excess = straight = rows.excess(soft[0] + soft[1] @ step)
                 if rows.curved:
-                    value, _, slope = rows.condensed(*point, prepared.from_u, target.e)
-                    excess = rows.excess(value)
-                    straight = rows.excess(linear)
+                    excess = rows.excess(rows.values(*point, target.e))
                     # a hard bound that the QP keeps is kept to the tolerance
                     allowed = np.where(rows.hard & (straight == 0), 0.0, STRAIGHT)
                     beyond = float(np.max((excess - straight) / rows.scale - allowed))
-                    soft = value - slope @ step, slope
-                else:
-                    excess = rows.excess(linear)
                 largest, given_way = rows.largest(excess), rows.given_way(excess)
             cost = self.problem.cost(z, prepared.u + inputs, prepared.u_prev, target, excess)
             if not np.isfinite(cost):
@@ -374,10 +359,14 @@ class CondensedController(SplitController):
                     defect=_largest(prepared.defects), timing=self._timing(prepared, start), excess=largest,
                     w=target.w, steady=target.steady, active=active, given_way=given_way, multipliers=multipliers,
                 )  # fmt: skip
-            if not beyond > 0 or soft is None or not left or not np.isfinite(soft[1]).all():
-                return replace(best, timing=self._timing(prepared, start))
-            left -= 1
+            if not beyond > 0 or not left:
+                break
+            value, _, slope = rows.condensed(*point, prepared.from_u, target.e)
+            if not np.isfinite(slope).all():
+                break
+            soft, left = (value - slope @ step, slope), left - 1
             ahead = -np.hstack([(prepared.from_u[: n_x * len(u)] @ step).reshape(-1, n_x), inputs])
+        return replace(best, timing=self._timing(prepared, start))
 
     def _by_inputs(self, prepared: Prepared, slope: Array) -> Array:
         """Derivatives by the stages' ``(x, u)`` ``(N, n_x + n_u)`` as those by the inputs ``(N n_u,)``."""
@@ -445,8 +434,7 @@ class CondensedController(SplitController):
         spent = (perf_counter() - start) * 1e3
         return Prepared(
             u, z, d, u_prev, a_t, b, z_next - z[1:], from_u, weighted, self._direct(u.ravel(), u_prev), hessian, weight,
-            soft, economic, spent, w, e, steady, active,
-            multipliers,
+            soft, economic, spent, w, e, steady, active, multipliers,
         )  # fmt: skip
 
     def _of_inputs(self, b: Array, u: Array) -> Array:

@@ -543,8 +543,7 @@ static real violation(int kind, real value) {
 
 /* Cost of the prepared plan with the step qp.step and the inputs s->plan.u, and its largest violations of soft and of
    hard bounds. bent: largest violation of a bound beyond that of its linearization, over its size and beyond the
-   tolerance. 0 if its states
-   diverge: x_reach holds ten widths beyond their declared ranges. */
+   tolerance. Returns 0 if its states diverge: x_reach holds ten widths beyond their declared ranges. */
 static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int rows, const real *u_goal, real *bent) {
   const hmpc_linear *const linear = &s->linear;
   const real *const step = s->qp.step;
