@@ -484,7 +484,7 @@ static void state_at(const hmpc_state *s, const real *step, int k, real *x) {
 /* Adds the curvature of the bounds, weighted with their multipliers, to Hessian and gradient of the QP (sequential
    convex quadratic programming). step: the curvature at s->plan, which has this step; NULL: at the linearization.
    Source: Verschueren, van Duijkeren, Quirynen, Diehl, CDC 2016. */
-static void bend(hmpc_state *s, const hmpc_goal *goal, const real *step) {
+static void bend_qp(hmpc_state *s, const hmpc_goal *goal, const real *step) {
   hmpc_linear *const linear = &s->linear;
   hmpc_qp *const qp = &s->qp;
   int changed = step != 0;
@@ -747,7 +747,7 @@ static int embed(hmpc_state *s, const hmpc_goal *goal, const real *w, int w_rows
     }
 #if HMPC_BENT
   memcpy(linear->gradient, qp->gradient, sizeof linear->gradient);
-  bend(s, goal, (const real *)0);
+  bend_qp(s, goal, (const real *)0);
 #else
   for (int i = 0; i < HMPC_NV; ++i) qp->gradient[i] /= qp->size;
 #endif
@@ -789,7 +789,7 @@ static hmpc_status solve_plan(hmpc_state *s, const hmpc_goal *goal, const real *
   if (status != HMPC_SOLVED && weighted) { /* the multipliers of the last plan may not fit any more */
     memset(s->linear.multiplier, 0, sizeof s->linear.multiplier);
     s->working.count = 0;
-    bend(s, goal, (const real *)0);
+    bend_qp(s, goal, (const real *)0);
     status = hmpc_qp_solve(&s->qp, &s->working, linear);
   }
 #endif
@@ -806,7 +806,7 @@ static hmpc_status solve_plan(hmpc_state *s, const hmpc_goal *goal, const real *
   for (int again = 0; again < HMPC_CORRECTIONS && bent > R(0.0); ++again) {
     real step[HMPC_LD];
     memcpy(step, s->qp.step, sizeof step);
-    bend(s, goal, step);
+    bend_qp(s, goal, step);
     straighten(s, goal, step);
     status = hmpc_qp_solve(&s->qp, &s->working, linear);
     if (status != HMPC_SOLVED) {
