@@ -34,6 +34,8 @@ USABLE = 0.5
 """Widths beyond its declared range in which a state of a free run may be: there the first linearization still holds."""
 HALVINGS = 30
 """Halvings of the distance to an admissible input: the rest is 1e-9 of it."""
+CONCAVE = 1e-12
+"""Eigenvalue of a Hessian with the wrong sign, over the largest one, that counts as rounding."""
 KNOTS = 8
 """Most set-points of one preview with a steady state of their own. For a reference that changes all the time, steady
 states are interpolated between so many rows."""
@@ -165,6 +167,8 @@ class BoundRows:
     """Whether a bounded value depends on ``e``."""
     curved: bool
     """Whether a bounded value is not affine in state and input."""
+    convex: NDArray[np.bool_]
+    """Which rows ``(M,)`` are curved, quadratic and bounded on their convex side, as a circle that may not be left."""
     on_inputs: InputBounds
     """The hard bounds on expressions of the inputs alone."""
 
@@ -195,6 +199,11 @@ class BoundRows:
         )
         counts = [rows.shape[1] for rows in each]
         self.hard = hard > 0
+        bends = [
+            bend is not None and _is_convex(g.function, *g.rows[:2])
+            for bend, (g,) in zip(self._curvature, blocks[1:], strict=True)
+        ]
+        self.convex = np.repeat([False, *bends], n * np.array(counts))
         self.stage = np.concatenate(
             [np.repeat(np.arange(n) + (b == 0), count) for b, count in enumerate(counts)]
         )
@@ -584,6 +593,22 @@ def _curvature(f: ca.Function) -> ca.Function:
     )
     x, u, e, m = (ca.MX.sym(name, n) for name, n in zip("xuem", (n_x, n_u, n_e, m.numel()), strict=True))
     return ca.Function("curvature", [x, u, e, m], [both(ca.vertcat(x, u), e, m)])
+
+
+def _is_convex(f: ca.Function | None, lower: Array, upper: Array) -> bool:
+    """Whether ``lower <= f(x, u, e) <= upper`` is a convex set by its Hessians, which must be the same everywhere."""
+    assert f is not None
+    bends, rng = _curvature(f), np.random.default_rng(0)
+    points = [[rng.standard_normal(f.size1_in(i)) for i in range(3)] for _ in range(3)]
+    for one, low, high in zip(np.eye(f.numel_out(0)), lower, upper, strict=True):
+        here, *others = (bends(*point, one).full() for point in points)
+        if not all(np.array_equal(here, other) for other in others):
+            return False
+        values = np.linalg.eigvalsh(here)
+        rounded = CONCAVE * np.max(np.abs(values))
+        if (np.isfinite(high) and values[0] < -rounded) or (np.isfinite(low) and values[-1] > rounded):
+            return False
+    return True
 
 
 def convex_part(curvature: Array, size: Array) -> Array:

@@ -304,9 +304,10 @@ class CondensedController(SplitController):
     ) -> Solution:  # fmt: skip
         """Solve the QP of Hessian and gradient ``quadratic`` around the run ``(free, drift)``, and check its solution.
 
-        The Hessian also has the curvature of the bounds, weighted with their multipliers (sequential convex quadratic
-        programming). If the plan violates a curved bound more than its linearization, the bounds alone are linearized
-        again at the plan and the QP is solved again, at most :data:`CORRECTIONS` times; the cheapest plan counts.
+        The Hessian also has the curvature of convex bounds (:attr:`~hybrid_mpc.control.problem.SoftRows.convex`),
+        weighted with their multipliers (sequential convex quadratic programming). If the plan then violates such a
+        bound more than its linearization, the bounds alone are linearized again at the plan and the QP is solved again,
+        at most :data:`CORRECTIONS` times; the cheapest plan counts.
 
         Source: Verschueren, van Duijkeren, Quirynen, Diehl, *Exploiting convexity in direct optimal control: a
         sequential convex quadratic programming method*, CDC 2016.
@@ -347,12 +348,16 @@ class CondensedController(SplitController):
                     excess = rows.excess(rows.values(*point, target.e))
                     # a hard bound that the QP keeps is kept to the tolerance
                     allowed = np.where(rows.hard & (straight == 0), 0.0, STRAIGHT)
-                    beyond = float(np.max((excess - straight) / rows.scale - allowed))
+                    own = (excess - straight) / rows.scale - allowed
+                    beyond = float(np.max(own, initial=0.0, where=rows.convex))
                 largest, given_way = rows.largest(excess), rows.given_way(excess)
             cost = self.problem.cost(z, prepared.u + inputs, prepared.u_prev, target, excess)
             if not np.isfinite(cost):
                 return best or self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
-            multipliers, active = answer.multipliers if rows.curved else None, answer.active
+            multipliers, active = (
+                answer.multipliers * rows.convex if rows.convex.any() else None,
+                answer.active,
+            )
             if best is None or cost < best.cost:
                 best = Solution(
                     u=u, x=z[:, :n_x], h=z[:, n_x:], d=estimate.d, cost=cost, status=answer.status, kkt=answer.kkt,

@@ -513,6 +513,7 @@ def _tables(
     whole: dict[str, Array | NDArray[np.int64] | NDArray[np.bool_] | list[int]] = {
         "block_of": np.repeat(np.arange(starts.size), lengths), "block_start": starts, "block_length": lengths,
         "soft_state": soft.states, "soft_first": _first_periods(soft, n), "soft_hard": soft.hard[kinds],
+        "soft_convex": soft.convex[kinds],
         "input_kind": soft.on_inputs.kinds,
         "target_knots": np.linspace(0, n, KNOTS).astype(int),
     }  # fmt: skip

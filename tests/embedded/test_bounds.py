@@ -54,7 +54,6 @@ AWAY = ca.Function("wall", [X, U, W, P], [X[0] - P])
 NEAR = SoftBound(ca.Function("near", [X, U, W, P], [X[0] - 0.9 * P]), [-np.inf], [0.0], [1.0], [1.0])
 TARGET = HardBound("x", [0.2, -0.05], [0.3, 0.05], at_end=True)
 FAST_AND_FAR = HardBound(ca.Function("ellipse", [X, U], [(X[0] / 0.5) ** 2 + X[1] ** 2]), [-np.inf], [1.0])
-POWER = SoftBound(ca.Function("power", [X, U], [U * X[1]]), [-0.3], [0.3], [10.0], [10.0])
 FORCE = HardBound(ca.Function("force", [X, U], [U**2 + 0.1 * X[1] ** 2]), [-np.inf], [0.7], priority=1)
 BEHIND = HardBound(ca.Function("behind", [X, U, W, P], [X[0] * P + 0.1 * X[1] ** 2]), [-np.inf], [0.5])
 KEPT = {"band": 1e-8}
@@ -70,7 +69,6 @@ CASES = {
     "at the end": (lambda: parts.cart([TARGET], horizon=12), thrown),
     "moving wall": (lambda: parts.cart([HardBound(AWAY, [-np.inf], [0.0])], soft=[NEAR]), with_walls),
     "ellipse": (lambda: parts.cart([FAST_AND_FAR, FORCE]), thrown),
-    "power": (lambda: parts.cart([FORCE], soft=[POWER], blocks=(1, 1, 3, 5, 15)), thrown),
     "moving ellipse": (lambda: parts.cart([BEHIND]), with_walls),
     "bounded": (parts.bounded, around),
     "band": (parts.band, asked),

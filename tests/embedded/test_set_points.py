@@ -178,10 +178,7 @@ def test_steady_states_are_those_of_python(name):
             ):
                 off = np.abs(getattr(found.steady, key) - getattr(wanted.steady, key)) / scale
                 assert np.max(off, initial=0.0) < 1e-9, (k, key)
-        # where limits of inputs and the bound on their product act together, its multiplier is not unique, so its
-        # curvature differs
-        most = 0.1 if name == "heater or vent" else 1e-9
-        assert np.max(np.abs(found.u - wanted.u) / ocp.input_range) < most, k
+        assert np.max(np.abs(found.u - wanted.u) / ocp.input_range) < 1e-9, k
         ends["reached"] += wanted.steady.reached
         ends["steady"] += wanted.steady.steady
         plan = wanted

@@ -492,8 +492,10 @@ static void bend_qp(hmpc_state *s, const hmpc_goal *goal, const real *step) {
     real x[HMPC_NX];
     changed |= linear->bends[k];
     linear->bends[k] = 0;
-    for (int e = 0; e < HMPC_SOFT_E; ++e)
+    for (int e = 0; e < HMPC_SOFT_E; ++e) {
+      if (!soft_convex[HMPC_SOFT_X + e]) linear->multiplier[k][e] = R(0.0);
       linear->bends[k] |= linear->multiplier[k][e] < R(0.0) || linear->multiplier[k][e] > R(0.0);
+    }
     if (!linear->bends[k]) continue;
     changed = 1;
     if (step) state_at(s, step, k, x);
@@ -624,7 +626,8 @@ static int assess(hmpc_state *s, const hmpc_goal *goals, const real *x_goal, int
       const real straight = over;
       over = violation(kind, linear->actual[period][kind - HMPC_SOFT_X]);
       const int kept = soft_hard[kind] && !(straight > R(0.0)); /* a hard bound that the QP keeps */
-      *bent = hmpc_max(*bent, (over - straight) / soft_scale[kind] - (kept ? R(0.0) : HMPC_STRAIGHT));
+      if (soft_convex[kind])
+        *bent = hmpc_max(*bent, (over - straight) / soft_scale[kind] - (kept ? R(0.0) : HMPC_STRAIGHT));
     }
 #endif
     if (soft_hard[kind]) {
