@@ -7,7 +7,8 @@ load's size. Everything else is that of the default observer, the process noise,
 
 - ``three``: the default observer without its filter of outliers;
 - ``small``: the default observer with jumps of 5 % of every load's size;
-- ``rates``: a disturbance at the rate of the state that each output measures.
+- ``rates``: a disturbance at the rate of the state that each output measures;
+- ``noise:0.05``: the default observer with noise at the inputs, a share of their ranges per period.
 
 ``--outliers 0.01`` puts samples off by 5 to 50 standard deviations in that share of the outputs' samples. The ratios
 are paired by seeds: geometric means with 95 % intervals over the default's loops.
@@ -33,7 +34,7 @@ from unknown_loops import interval, prepared
 from hybrid_mpc import Estimate, ExtendedKalmanFilter, SwitchingFilter
 from hybrid_mpc.control.sizes import disturbance_sizes
 from hybrid_mpc.estimate.switching import OUTLIER, SLIP, SWITCHES, Filter, with_outliers
-from hybrid_mpc.kit.assembly import FIRST_LOAD, JUMP, first_deviations, make_controller
+from hybrid_mpc.kit.assembly import FIRST_LOAD, JUMP, first_deviations, make_controller, make_estimator
 from hybrid_mpc.kit.disturbances import rates_of_outputs
 from hybrid_mpc.loop.loop import Loop
 
@@ -91,6 +92,11 @@ def compared(
     for one in steps:
         if one == "rates" and other is not None:
             observers[one] = other.parts[0]
+        elif one.startswith("noise:"):
+            share_of = float(one.removeprefix("noise:"))
+            observers[one] = make_estimator(
+                own.model, own.scenario, own.noise[0], own.control, input_noise=share_of
+            )
         elif one == "three":
             observers[one] = SwitchingFilter(default.filters[:3], SWITCHES)
         elif one == "small":
@@ -124,8 +130,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--names", nargs="+", required=True, help="machines")
-    parser.add_argument("--steps", nargs="+", required=True, help="paces, quiet/slip; three, small, rates")
+    parser.add_argument(
+        "--steps", nargs="+", required=True, help="paces, quiet/slip; three, small, rates, noise:SHARE"
+    )
     parser.add_argument("--seeds", type=int, default=10, help="paired loops of each machine")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--outliers", type=float, default=0.0, help="share of outliers in the samples")
     given = parser.parse_args()
     print("| machine | quiet/slip | settled | cost over the default's | largest | moves |\n|" + " --- |" * 6)
@@ -136,7 +145,7 @@ def main() -> None:
                 other = (
                     prepared(machine, Path(folder), rates_of_outputs)[1] if "rates" in given.steps else None
                 )
-                trials = trials_of(machine.name, plant, own, 0, given.seeds)
+                trials = trials_of(machine.name, plant, own, given.first, given.seeds)
                 print(
                     *compared(machine.name, plant, own, other, trials, given.steps, given.outliers),
                     sep="\n",

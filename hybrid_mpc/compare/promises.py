@@ -1354,10 +1354,7 @@ def examine(
     elsewhere = loads_elsewhere(kit, points[0])
     late = late_inputs(kit, points[0], lacking_delay)
     return (
-        *(
-            advised(no_offset(point, trials, len(points) > 1), kit, [point], [trials])
-            for point, trials in zip(points, every, strict=True)
-        ),
+        *_offset_rows(kit, points, every),
         *([] if elsewhere is None else [elsewhere]),
         tasks_end(ends, where),
         time,
@@ -1387,13 +1384,23 @@ def advised(row: Promise, kit: Kit, points: Sequence[SetPoint], every: Sequence[
     ]
     if row.verdict == "shown" or not lost or any(ranks(point).why for point, *_ in lost):
         return row
+    make = kit.tracking_observer if points[0].tracking else kit.observer
     for point, draw, periods in lost:
-        estimator = kit.observer(task=_find_own_problem(kit, point), input_noise=ROBUST)
+        estimator = make(task=_find_own_problem(kit, point), input_noise=ROBUST)
         one = trial(replace(point, estimator=estimator), draw, periods)
         if one.why or one.fails:
             return row
     again = "it settles" if len(lost) == 1 else "they settle"
-    return replace(row, remedy=f"{row.remedy} Or use kit.observer(input_noise={ROBUST:g}): with it {again}.")
+    return replace(
+        row, remedy=f"{row.remedy} Or use kit.{make.__name__}(input_noise={ROBUST:g}): with it {again}."
+    )
+
+
+def _offset_rows(kit: Kit, points: Sequence[SetPoint], every: Sequence[Sequence[Trial]]) -> list[Promise]:
+    return [
+        advised(no_offset(point, trials, len(points) > 1), kit, [point], [trials])
+        for point, trials in zip(points, every, strict=True)
+    ]
 
 
 def _find_trials(points: Sequence[SetPoint], report: Callable[[int, int, str], None]) -> list[list[Trial]]:
@@ -1441,11 +1448,15 @@ def examine_tracking(
     fails = failing_loop(points, every)
     own = [one for trials in every for one in trials if not one.fails]
     rows = [
-        *(no_offset(point, trials, len(points) > 1) for point, trials in zip(points, every, strict=True)),
+        *_offset_rows(kit, points, every),
         late_inputs(kit, points[0], lacking_delay),
     ]
     time = step_time(own or every[0], 1e3 * points[0].model.dt)
-    rows = [*(rows if fails is None else [fails]), time, margins(points, lacking_delay=lacking_delay)]
+    rows = [
+        *(rows if fails is None else [advised(fails, kit, points, every)]),
+        time,
+        margins(points, lacking_delay=lacking_delay),
+    ]
     return tuple(replace(row, name=f"{row.name}, tracking") for row in rows if row is not None)
 
 

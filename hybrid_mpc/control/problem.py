@@ -129,15 +129,8 @@ class Solution:
         c = self.curvature
         c = None if c is None else np.concatenate([c[:1], c[:-1]])
         return replace(
-            self,
-            u=np.vstack([u_held[None], self.u[:-1]]),
-            x=x,
-            h=h,
-            w=w,
-            curvature=c,
-            active=None,
-            multipliers=None,
-        )
+            self, u=np.vstack([u_held[None], self.u[:-1]]), x=x, h=h, w=w, curvature=c, active=None, multipliers=None
+        )  # fmt: skip
 
 
 class UnreachedBound(InputError):
@@ -611,17 +604,6 @@ def _is_convex(f: ca.Function | None, lower: Array, upper: Array) -> bool:
     return True
 
 
-def convex_part(curvature: Array, size: Array) -> Array:
-    """Symmetric matrices ``(N, n, n)`` with zero instead of their negative eigenvalues.
-
-    Eigenvectors are those of the matrix scaled with ``size`` ``(n,)``, so the result does not depend on units.
-    """
-    both = np.outer(size, size)
-    values, vectors = np.linalg.eigh(curvature * both)
-    flat = np.maximum(values, 0.0)[:, None, :]
-    return np.asarray((vectors * flat) @ vectors.transpose(0, 2, 1) / both)
-
-
 def stage_cost(ocp: OCP, model: HybridModel | None = None) -> ca.Function | None:
     """The non-quadratic stage cost, ``(x, u, p) -> scalar``: the economic cost plus that of the outputs.
 
@@ -688,9 +670,17 @@ class StageCost:
         return slope, self._dt * f.outputs[1].reshape(n, slope.shape[1], -1)
 
     def convex(self, x: Array, u: Array, p: Array | None = None) -> tuple[Array, Array]:
-        """The same with positive semi-definite second derivatives (:func:`convex_part`)."""
+        """The same with positive semi-definite second derivatives: negative curvature is replaced by zero.
+
+        Eigenvectors are those of the scaled matrix, so the result does not depend on units.
+        """
         slope, curvature = self.derivatives(x, u, p)
-        return slope, convex_part(curvature, self.size) if np.all(np.isfinite(curvature)) else curvature
+        if not np.all(np.isfinite(curvature)):
+            return slope, curvature
+        both = np.outer(self.size, self.size)
+        values, vectors = np.linalg.eigh(curvature * both)
+        flat = np.maximum(values, 0.0)[:, None, :]
+        return slope, (vectors * flat) @ vectors.transpose(0, 2, 1) / both
 
     def _fill(self, f: BufferedFunction, x: Array, u: Array, p: Array | None) -> None:
         f.inputs[0][:], f.inputs[1][:] = x[: self._n].ravel(), u.ravel()

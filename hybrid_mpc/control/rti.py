@@ -16,7 +16,6 @@ from hybrid_mpc.control.problem import (
     SplitController,
     Status,
     Target,
-    convex_part,
     weights_ok,
 )
 from hybrid_mpc.control.qp import InputQP
@@ -304,7 +303,7 @@ class CondensedController(SplitController):
     ) -> Solution:  # fmt: skip
         """Solve the QP of Hessian and gradient ``quadratic`` around the run ``(free, drift)``, and check its solution.
 
-        The Hessian also has the curvature of convex bounds (:attr:`~hybrid_mpc.control.problem.SoftRows.convex`),
+        The Hessian also has the curvature of convex bounds (:attr:`~hybrid_mpc.control.problem.BoundRows.convex`),
         weighted with their multipliers (sequential convex quadratic programming). If the plan then violates such a
         bound more than its linearization, the bounds alone are linearized again at the plan and the QP is solved again,
         at most :data:`CORRECTIONS` times; the cheapest plan counts.
@@ -316,9 +315,8 @@ class CondensedController(SplitController):
         free, drift = run
         lower, upper = self.ocp.bounds(prepared.u_prev, limits) if limits is not None else self._own_bounds
         point = prepared.z[:, :n_x], prepared.u
-        ahead = np.hstack(
-            [free[:-1, :n_x], np.zeros_like(prepared.u)]
-        )  # from there to the plan without a step
+        # from there to the plan without a step
+        ahead = np.hstack([free[:-1, :n_x], np.zeros_like(prepared.u)])
         multipliers, active = prepared.multipliers, prepared.active
         left = CORRECTIONS
         while True:
@@ -326,7 +324,6 @@ class CondensedController(SplitController):
             if weighted := multipliers is not None and bool(multipliers.any()):
                 curvature = rows.curvature(*point, multipliers, target.e)
                 curvature[~np.isfinite(curvature).all(axis=(1, 2))] = 0.0
-                curvature = convex_part(curvature, self.problem.economic.size)
                 hessian = hessian + condense_hessians(curvature, prepared.from_u, n_x)
                 gradient = gradient + self._by_inputs(prepared, (curvature @ ahead[:, :, None])[:, :, 0])
             answer = self.qp.solve(
@@ -354,10 +351,8 @@ class CondensedController(SplitController):
             cost = self.problem.cost(z, prepared.u + inputs, prepared.u_prev, target, excess)
             if not np.isfinite(cost):
                 return best or self._failed(prepared, Status.NOT_FINITE, start, answer.kkt)
-            multipliers, active = (
-                answer.multipliers * rows.convex if rows.convex.any() else None,
-                answer.active,
-            )
+            multipliers = answer.multipliers * rows.convex if rows.convex.any() else None
+            active = answer.active
             if best is None or cost < best.cost:
                 best = Solution(
                     u=u, x=z[:, :n_x], h=z[:, n_x:], d=estimate.d, cost=cost, status=answer.status, kkt=answer.kkt,

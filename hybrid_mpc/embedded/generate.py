@@ -407,7 +407,7 @@ def _expressions(
             m, both = ca.SX.sym("m", value.numel()), ca.vertcat(x, u)
             curve, n = ca.densify(ca.hessian(ca.dot(m, value), both)[0]), both.numel()
             add("bounds_values", [*arguments[:5], "real *value"], given, outs[: value.numel()])
-            outs = [(f"curve[{i * n + j}]", curve[i, j]) for i in range(n) for j in range(i + 1)]
+            outs = [(f"curve[{i * n + j}]", curve[i, j]) for i in range(n) for j in range(n)]
             add("bounds_curvature", [*arguments[:5], "const real *m", "real *curve"], given | {"m": m}, outs)
     if asked["INPUT_BOUNDS"]:
         value = scalar_code("controller: hard bounds on inputs", soft.on_inputs.function)(u)

@@ -514,8 +514,9 @@ class Kit:
         )
 
     def tracking_observer(
-        self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching"
-    ) -> TrackingFilter:
+        self, model: str = "", *, task: str = "", load: bool = True, kind: str = "switching",
+        input_noise: float = 0.0,
+    ) -> TrackingFilter:  # fmt: skip
         """:meth:`observer` that also tracks the parameters that differ between recordings (docs/tracking.md).
 
         Its estimates belong to the model whose last measured disturbances are the tracked parameters; a loop needs the
@@ -526,6 +527,7 @@ class Kit:
             task: As for :meth:`observer`.
             load: As for :meth:`observer`.
             kind: As for :meth:`observer`.
+            input_noise: As for :meth:`observer`.
 
         Raises:
             InputError: If the kit names no tracked parameters, or as :meth:`observer`.
@@ -533,7 +535,8 @@ class Kit:
         Example:
             ``loop = hm.Loop(kit.tracking_observer(), kit.controller(tracking=True), reference=[0.5])``
         """
-        return TrackingFilter(self.observer(model, task=task, load=load, kind=kind), self._tracked())
+        own = self.observer(model, task=task, load=load, kind=kind, input_noise=input_noise)
+        return TrackingFilter(own, self._tracked())
 
     def with_tracked(self, tracked: Sequence[TrackedParameter]) -> Kit:
         """A kit whose :meth:`tracking_observer` tracks these parameters."""

@@ -237,9 +237,9 @@ def make_estimator(
             with observers*, IEEE TAC 24, 1979). Default: 0.
 
     Raises:
-        InputError: If the kind is unknown, the size of ``sensor_sigma`` or ``first_sigma`` is wrong, there is no
-            control problem, the disturbances are not observable, or the process noise hides them, so that a load is
-            never estimated.
+        InputError: If the kind is unknown, ``input_noise`` is negative, the size of ``sensor_sigma`` or ``first_sigma``
+            is wrong, there is no control problem, the disturbances are not observable, or the process noise hides them,
+            so that a load is never estimated.
 
     Example:
         ``make_estimator(model, scenario, process_noise(model, train))``
@@ -271,7 +271,11 @@ def make_estimator(
     if not observer:
         return filter_of(sigma_x, None, make)
     periods = round(FOUND_HORIZONS * control.horizon)
-    robust = np.hypot(sigma_x, input_noise * _moved(model, control.input_range))
+    if not 0.0 <= input_noise < np.inf:
+        raise InputError(
+            f"input_noise: must be zero or more, a share of the inputs' ranges, got {input_noise} [HM-KIT-044]"
+        )
+    robust = np.hypot(sigma_x, input_noise * _moved(model, control.input_range)) if input_noise else sigma_x
     quiet = quiet_shares(partial(filter_of, robust), periods, model.n_d)
     if kind != "switching":
         _check_found((filter_of(robust, quiet),), SEARCHED * control.horizon, Sizes(model, control).states)

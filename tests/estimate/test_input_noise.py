@@ -4,11 +4,13 @@ from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
+import pytest
 
 from hybrid_mpc import (
     OCP,
     CondensedController,
     HybridModel,
+    InputError,
     Signal,
     linearize,
     make_estimator,
@@ -48,6 +50,12 @@ def test_the_quiet_filter_assumes_independent_noise_at_the_inputs():
     np.testing.assert_allclose(slip, np.maximum((10 * SIGMA_X) ** 2, quiet), rtol=1e-9)  # never quieter
     for others in (jump, outlier):
         np.testing.assert_allclose(others, SIGMA_X**2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("share", [-0.1, np.nan, np.inf])
+def test_a_share_below_zero_is_refused(share):
+    with pytest.raises(InputError, match="HM-KIT-044"):
+        filters(share)
 
 
 def test_it_brings_back_margin():

@@ -133,9 +133,7 @@ static const real *cost_y(const hmpc_state *s, int k) {
   return (const real *)0;
 #endif
 }
-#endif
 
-#if HMPC_STAGE_COST || HMPC_BENT
 /* Eigenvalues (diagonal of a on return) and eigenvectors (rows of v) of a symmetric matrix by Jacobi rotations.
    Source: Golub and Van Loan, Matrix Computations, 2013, section 8.5. */
 static void eigen(real (*a)[HMPC_NC], real (*v)[HMPC_NC]) {
@@ -183,7 +181,9 @@ static void make_convex(real (*curve)[HMPC_NC]) {
     for (int i = 0; i < HMPC_NC && a[e][e] > R(0.0); ++i)
       for (int j = 0; j < HMPC_NC; ++j) curve[i][j] += a[e][e] * v[e][i] * v[e][j] / (cost_size[i] * cost_size[j]);
 }
+#endif
 
+#if HMPC_STAGE_COST || HMPC_BENT
 /* Derivatives of state and input of period k by the unknowns. Returns the number of unknowns they depend on. */
 static int stage_rows(const hmpc_linear *linear, int k, real (*rows)[HMPC_LD]) {
   const int first = block_of[k] * HMPC_NU;
@@ -502,7 +502,6 @@ static void bend_qp(hmpc_state *s, const hmpc_goal *goal, const real *step) {
     bounds_curvature(step ? x : linear->z[k], step ? s->plan.u[k] : linear->u[k], linear->w[k], s->d, goal_p(goal, k),
                      linear->multiplier[k], linear->bend[k][0]);
     linear->bends[k] = hmpc_all_finite(linear->bend[k][0], HMPC_NC * HMPC_NC);
-    if (linear->bends[k]) make_convex(linear->bend[k]);
   }
   if (changed) make_hessian(s);
   memcpy(qp->gradient, linear->gradient, sizeof qp->gradient);
