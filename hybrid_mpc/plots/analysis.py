@@ -207,7 +207,6 @@ def bode(
     figure, axes = new_figure(2, 1, sharex=True, size=(9, 5.4))
     magnitude_ax, phase_ax = axes[:, 0]
     lowest, phases = np.inf, []
-    first: tuple[NDArray[Any], NDArray[Any]] | None = None
     unknown = [name for name in responses if name.partition(",")[0] not in COLOURS]
     for model, (omega, magnitude, phase) in responses.items():
         omega = np.asarray(omega, dtype=float)
@@ -216,10 +215,6 @@ def bode(
             line["color"] = _COLOURS[unknown.index(model) % len(_COLOURS)]
         size = checked(f"magnitude of {model}", magnitude, len(omega))
         angle = np.degrees(checked(f"phase of {model}", phase, len(omega)))
-        if first is None:
-            first = omega, angle
-        else:  # -180 and 180 degrees are the same: whole turns are chosen so that models can be compared
-            angle = angle - 360.0 * np.round((angle - np.interp(omega, *first)) / 360.0)
         # at the Nyquist frequency a sampled response is real: its magnitude may vanish and its phase may jump
         clear = omega < (np.inf if nyquist is None else 0.98 * nyquist)
         magnitude_ax.loglog(omega, size, **line)

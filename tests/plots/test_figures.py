@@ -264,19 +264,6 @@ def test_a_bode_plot_is_not_squeezed_by_the_nyquist_frequency():
     assert np.all(np.diff(figure.axes[1].get_yticks()) == 90)
 
 
-def test_phases_of_two_models_do_not_differ_by_whole_turns():
-    """Two resonances with hardly any damping: the phase steps by half a turn, up or down by rounding."""
-    omega = np.geomspace(1.0, 100.0, 50)
-    down = np.where(omega < 10.0, 0.0, -np.pi) - 0.01 * omega
-    up = np.where(omega < 10.0, 0.0, np.pi) - 0.011 * omega
-    size = np.ones(50)
-    figure = analysis.bode(
-        {"prior": (omega, size, down), "hybrid": (omega, size, up)}, input_signal=U, output_signal=Y
-    )
-    prior, hybrid = (line.get_ydata() for line in drawn(figure.axes[1]).values())
-    assert np.max(np.abs(hybrid - prior)) < 10.0
-
-
 def test_responses_of_names_of_your_own_can_be_told_apart():
     response = np.array([1.0, 2.0]), np.ones(2), np.zeros(2)
     figure = analysis.bode({"power1": response, "power2": response}, input_signal=U, output_signal=Y)
