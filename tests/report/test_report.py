@@ -3,14 +3,17 @@
 import base64
 import re
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hybrid_mpc import InputError
+from hybrid_mpc.analyze.properties import Mode
 from hybrid_mpc.report.page import KeyFigure, Report, Section, Table, render, words, write_report
-from hybrid_mpc.workflow.stages.report import TITLES
+from hybrid_mpc.workflow.stages.report import TITLES, _pole_table
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report_example as example
@@ -138,3 +141,16 @@ def test_general_texts_are_whole_html():
         page = Page(" ".join(paragraphs))
         assert page.open == [], key
         assert key == "glossary" or 2 <= len(re.findall(r"[.:](?:\s|<|$)", page.text)) <= 12
+
+
+def test_the_table_of_poles_explains_models_of_which_only_one_is_stable():
+    mode = Mode(0.99 + 0.1j, 4.0, 0.01, 1.0, 1.0)
+    grown = replace(mode, pole=1.001 + 0.1j, damping=-0.01)
+
+    def caption(other):
+        models = {"prior": SimpleNamespace(points={"moving": (mode,)}),
+                  "hybrid": SimpleNamespace(points={"moving": (other,)})}  # fmt: skip
+        return _pole_table(SimpleNamespace(models=models)).caption
+
+    assert "180" in caption(grown)
+    assert "180" not in caption(mode)

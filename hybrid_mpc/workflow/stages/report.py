@@ -712,16 +712,24 @@ def _delays_of(faults: Sequence[FaultedLoop]) -> tuple[str, str]:
 
 
 def _pole_table(analysis: LinearizedModels) -> Table:
-    rows = []
+    rows, verdicts = [], dict[str, set[bool]]()
     for model, found in analysis.models.items():
         for point, own in found.points.items():
             slow = [f"{number(m.frequency)} ({m.damping:.2f})" for m in own[:2] if m.pole != 0]
             stable = all(abs(m.pole) < 1.0 for m in own)
+            verdicts.setdefault(point, set()).add(stable)
             rows.append((model, point, ", ".join(slow), stable, *stabilisable_detectable(own)))
     columns = ("model", "point", "slowest poles: rad/s (damping)", "stable", "stabilisable", "detectable")
     points = {"rest": "at rest", "moving": "at working speed"}
-    there = [points[p] for p in points if any(p in found.points for found in analysis.models.values())]
-    return Table(columns, rows, f"Poles of the models linearized {' and '.join(there)}.")
+    there = [points[p] for p in points if p in verdicts]
+    caption = f"Poles of the models linearized {' and '.join(there)}."
+    if differ := [points[p] for p in points if len(verdicts.get(p, ())) > 1]:
+        caption += (
+            f" Stable and unstable models {' and '.join(differ)}: near zero damping, a small error of a model changes "
+            "the sign of the damping. At a resonance the phase falls by 180° in a stable model and rises by 180° in an "
+            "unstable one; -180° and 180° are the same phase."
+        )
+    return Table(columns, rows, caption)
 
 
 REPORT = Stage(
